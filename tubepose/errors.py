@@ -1,0 +1,26 @@
+"""Errors that a user can correct.
+
+A `TubePoseError` always says three things in one line: what was found, what was expected, what to do.
+The command line prints it and exits with 1; a batch records it and goes on with the next capture.
+Bad data inside one frame is not an error but a status in the tables; a broken invariant is an ordinary exception.
+"""
+
+
+class TubePoseError(Exception):
+    """Base of all errors that a user can correct."""
+
+
+class LabwareError(TubePoseError):
+    """A labware definition is missing, unknown or wrong."""
+
+
+class CaptureError(TubePoseError):
+    """A capture or session file is missing, cut, or not what it claims to be."""
+
+
+class DetectorError(TubePoseError):
+    """A detector model or a file of boxes cannot be used."""
+
+
+class ConfigError(TubePoseError):
+    """A configuration file or an option is wrong."""

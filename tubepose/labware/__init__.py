@@ -1,0 +1,17 @@
+"""Racks, tubes and printed caps: definitions in YAML, a built-in catalogue, and the geometry that follows from them."""
+
+from tubepose.labware.models import CapModel, RackModel, SlotModel, TubeModel
+from tubepose.labware.reading import Labware, catalogue, load_cap, load_rack, load_tube, read_labware
+
+__all__ = [
+    "CapModel",
+    "Labware",
+    "RackModel",
+    "SlotModel",
+    "TubeModel",
+    "catalogue",
+    "load_cap",
+    "load_rack",
+    "load_tube",
+    "read_labware",
+]

@@ -1,0 +1,131 @@
+"""Labware definitions from YAML files and from the built-in catalogue."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Sequence
+from functools import cache
+from importlib.resources import files
+from pathlib import Path
+from typing import Any, TypeVar
+
+import yaml
+from pydantic import BaseModel, ValidationError
+
+from tubepose.errors import LabwareError, TubePoseError
+from tubepose.labware.models import CapModel, RackModel, TubeModel
+
+Labware = RackModel | TubeModel | CapModel
+_KINDS: dict[str, type[Labware]] = {"rack": RackModel, "tube": TubeModel, "cap": CapModel}
+_M = TypeVar("_M", bound=BaseModel)
+_L = TypeVar("_L", RackModel, TubeModel, CapModel)
+
+
+def read_yaml(path: Path, error: type[TubePoseError]) -> dict[str, Any]:
+    """Read one YAML mapping; raises `error` in one line if the file is missing, broken or no mapping."""
+    try:
+        data = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise error(f"{path}: no such file") from None
+    except (OSError, UnicodeDecodeError) as problem:
+        raise error(f"{path}: cannot be read: {problem}") from None
+    except yaml.YAMLError as problem:
+        raise error(f"{path}: not valid YAML: {' '.join(str(problem).split())}") from None
+    if not isinstance(data, dict):
+        raise error(f"{path}: expected a mapping of keys to values, found {type(data).__name__}")
+    return data
+
+
+def validate(model: type[_M], data: dict[str, Any], where: str, error: type[TubePoseError]) -> _M:
+    """Check data against a strict model; raises `error` in one line that names the key and the known ones."""
+    try:
+        return model.model_validate(data)
+    except ValidationError as problem:
+        found = "; ".join(_explain(model, entry) for entry in problem.errors())
+        # A key may itself hold a line break.
+        raise error(f"{where}: {' '.join(found.split())}") from None
+
+
+def _explain(model: type[BaseModel], entry: Any) -> str:
+    place = ".".join(str(part) for part in entry["loc"])
+    if entry["type"] == "extra_forbidden":
+        known = _known_keys(model, entry["loc"][:-1])
+        return f"unknown key '{place}'" + (f"; known keys: {', '.join(known)}" if known else "")
+    message = entry["msg"].removeprefix("Value error, ")
+    message = f"{place}: {message}" if place else message
+    given = entry["input"]
+    return (
+        message if isinstance(given, dict | list) or entry["type"] == "value_error" else f"{message} (found {given!r})"
+    )
+
+
+def _known_keys(model: type[BaseModel], place: Sequence[str | int]) -> list[str]:
+    """Field names of the (nested) model that a place in the data belongs to."""
+    for part in place:
+        if isinstance(part, int) or part not in model.model_fields:
+            continue
+        inner = [
+            t
+            for t in _types_in(model.model_fields[part].annotation)
+            if isinstance(t, type) and issubclass(t, BaseModel)
+        ]
+        if not inner:
+            return []
+        model = inner[0]
+    return list(model.model_fields)
+
+
+def _types_in(annotation: Any) -> list[Any]:
+    arguments = getattr(annotation, "__args__", ())
+    return [annotation] if not arguments else [t for argument in arguments for t in _types_in(argument)]
+
+
+def read_labware(path: Path) -> Labware:
+    """Read one definition file.
+
+    Raises:
+        LabwareError: The file is missing, is no YAML mapping, or breaks its model; one line that names the key.
+    """
+    data = read_yaml(path, LabwareError)
+    kind = data.get("kind")
+    if kind not in _KINDS:
+        raise LabwareError(f"{path}: expected 'kind: rack', 'kind: tube' or 'kind: cap', found {kind!r}")
+    return validate(_KINDS[kind], data, str(path), LabwareError)
+
+
+@cache
+def catalogue() -> dict[str, Labware]:
+    """All built-in definitions by name, sorted."""
+    folder = files("tubepose.labware") / "catalogue"
+    found = [read_labware(Path(str(entry))) for entry in folder.iterdir() if entry.name.endswith(".yaml")]
+    return {item.name: item for item in sorted(found, key=lambda item: item.name)}
+
+
+def _load(name_or_file: str, model: type[_L], kind: str, folder: Path | None) -> _L:
+    known = {name: item for name, item in catalogue().items() if isinstance(item, model)}
+    if name_or_file in known:
+        return known[name_or_file]
+    path = Path(name_or_file)
+    if path.suffix in (".yaml", ".yml"):
+        item = read_labware(folder / path if folder is not None else path)
+        if not isinstance(item, model):
+            raise LabwareError(f"{path}: expected a {kind}, found a {item.kind}")
+        return item
+    close = difflib.get_close_matches(name_or_file, known, n=1)
+    guess = f"; did you mean '{close[0]}'?" if close else ""
+    raise LabwareError(f"unknown {kind} '{name_or_file}'{guess} Known: {', '.join(known)}; or give a .yaml file")
+
+
+def load_rack(name_or_file: str, folder: Path | None = None) -> RackModel:
+    """A rack by catalogue name or by YAML file (relative to `folder` if given)."""
+    return _load(name_or_file, RackModel, "rack", folder)
+
+
+def load_tube(name_or_file: str, folder: Path | None = None) -> TubeModel:
+    """A tube by catalogue name or by YAML file (relative to `folder` if given)."""
+    return _load(name_or_file, TubeModel, "tube", folder)
+
+
+def load_cap(name_or_file: str, folder: Path | None = None) -> CapModel:
+    """A printed cap by catalogue name or by YAML file (relative to `folder` if given)."""
+    return _load(name_or_file, CapModel, "cap", folder)
