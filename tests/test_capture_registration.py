@@ -1,0 +1,76 @@
+from __future__ import annotations
+
+from itertools import permutations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from tubepose.capture import CameraIntrinsics, estimate_intrinsics, project_cloud
+from tubepose.capture.registration import clean_cloud
+from tubepose.transforms import axis_rotation, make_transform, transform_points
+
+CAMERA = CameraIntrinsics(width=20, height=10, fx=30.0, fy=31.0, cx=9.5, cy=4.5)
+
+
+@pytest.mark.parametrize("order", list(permutations(range(3))))
+def test_nearest_point_wins(order):
+    ray = CAMERA.rays()[3, 7]
+    points = np.array([ray * 1.0, ray * 0.5, ray * 2.0])[list(order)]
+    organised = project_cloud(points, np.eye(4), CAMERA)
+    np.testing.assert_array_equal(organised[3, 7], ray * 0.5)
+    assert np.isfinite(organised).all(axis=-1).sum() == 1
+
+
+def test_points_outside_behind_and_invalid_are_left_out():
+    points = np.array([[5.0, 0, 1], [0, 5, 1], [0, 0, -1], [0, 0, 0], [np.nan, 0, 1]])
+    assert np.isnan(project_cloud(points, np.eye(4), CAMERA)).all()
+
+
+@settings(max_examples=30, deadline=None)
+@given(seed=st.integers(0, 1000), x=st.floats(-0.3, 0.3), y=st.floats(-0.3, 0.3))
+def test_projection_undoes_the_place_of_the_sensor(seed, x, y):
+    rng = np.random.default_rng(seed)
+    cloud = CAMERA.backproject(rng.uniform(0.5, 1.5, (10, 20)))
+    T_cloud_image = make_transform(axis_rotation(np.array([x, y, 1.0])), rng.uniform(-1, 1, 3))
+    moved = rng.permutation(transform_points(T_cloud_image, cloud.reshape(-1, 3)))
+    organised = project_cloud(moved, np.linalg.inv(T_cloud_image), CAMERA)
+    np.testing.assert_allclose(organised, cloud, atol=1e-9)
+
+
+@settings(max_examples=30, deadline=None)
+@given(
+    fx=st.floats(100, 3000),
+    fy=st.floats(100, 3000),
+    cx=st.floats(-50, 100),
+    cy=st.floats(-50, 100),
+    seed=st.integers(0, 99),
+)
+def test_intrinsics_are_recovered_from_an_organised_cloud(fx, fy, cx, cy, seed):
+    camera = CameraIntrinsics(40, 30, fx, fy, cx, cy)
+    depth = np.random.default_rng(seed).uniform(0.4, 1.0, (30, 40))
+    depth[::3] = np.nan
+    found = estimate_intrinsics(camera.backproject(depth))
+    assert found is not None
+    assert (found.width, found.height) == (40, 30)
+    np.testing.assert_allclose([found.fx, found.fy, found.cx, found.cy], [fx, fy, cx, cy], rtol=1e-6, atol=1e-6)
+
+
+def test_cloud_that_is_no_pinhole_image_has_no_intrinsics():
+    rng = np.random.default_rng(0)
+    cloud = CAMERA.backproject(rng.uniform(0.5, 1.5, (10, 20)))
+    assert estimate_intrinsics(cloud) is not None
+    assert estimate_intrinsics(rng.permutation(cloud.reshape(-1, 3)).reshape(10, 20, 3)) is None
+    assert estimate_intrinsics(np.full((10, 20, 3), np.nan)) is None
+    assert estimate_intrinsics(np.tile([0.0, 0.0, 1.0], (10, 20, 1))) is None
+
+
+@pytest.mark.parametrize("scale", [1.0, 1e-3])
+def test_clean_cloud_scales_a_copy(scale):
+    xyz = np.array([[1.0, 2, 3], [0, 0, 0], [np.inf, 0, 1], [0, 0, 1]])
+    kept = xyz.copy()
+    cleaned = clean_cloud(xyz, scale)
+    np.testing.assert_array_equal(xyz, kept)
+    np.testing.assert_allclose(cleaned[[0, 3]], kept[[0, 3]] * scale)
+    assert np.isnan(cleaned[1:3]).all()

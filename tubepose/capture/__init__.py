@@ -1,0 +1,23 @@
+"""Recorded RGB-D captures: one model of a frame, several sources behind `open_captures`."""
+
+from tubepose.capture.folder import FolderCapture, PlyCapture
+from tubepose.capture.frame import CameraIntrinsics, RgbdFrame
+from tubepose.capture.mcap import McapCapture
+from tubepose.capture.mcap_writing import write_mcap
+from tubepose.capture.registration import estimate_intrinsics, project_cloud
+from tubepose.capture.source import Capture, open_captures
+from tubepose.capture.writing import write_folder_capture
+
+__all__ = [
+    "CameraIntrinsics",
+    "Capture",
+    "FolderCapture",
+    "McapCapture",
+    "PlyCapture",
+    "RgbdFrame",
+    "estimate_intrinsics",
+    "open_captures",
+    "project_cloud",
+    "write_folder_capture",
+    "write_mcap",
+]

@@ -1,0 +1,82 @@
+"""Image files and encoded images: 8-bit pictures in RGB order, 16-bit depth."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from tubepose.errors import CaptureError
+
+_PNG = b"\x89PNG"
+# Percentiles that a picture of more than 8 bits is stretched between: a reflection must not turn the rest black.
+_STRETCH_PERCENT = (0.5, 99.5)
+
+
+def read_bytes(path: Path) -> bytes:
+    """The content of a file; a missing or unreadable one is a `CaptureError` in one line."""
+    try:
+        return path.read_bytes()
+    except FileNotFoundError:
+        raise CaptureError(f"{path}: no such file") from None
+    except OSError as problem:
+        raise CaptureError(f"{path}: cannot be read: {problem.strerror}") from None
+
+
+def decode(data: bytes, where: str) -> NDArray[np.generic]:
+    """Pixels of a PNG or JPEG as they are stored, shape (H, W) or (H, W, C), OpenCV's channel order.
+
+    Raises:
+        CaptureError: Cut or no image at all. A PNG without its end is refused before libpng complains on stderr.
+    """
+    cut = data.startswith(_PNG) and b"IEND" not in data
+    flags = cv2.IMREAD_UNCHANGED | cv2.IMREAD_IGNORE_ORIENTATION
+    pixels = None if cut or not data else cv2.imdecode(np.frombuffer(data, np.uint8), flags)
+    if pixels is None:
+        raise CaptureError(
+            f"{where}: {'truncated' if cut else 'cannot be decoded'}; expected a whole PNG or JPEG image"
+        )
+    return np.asarray(pixels)
+
+
+def to_picture(pixels: NDArray[np.generic], *, bgr: bool) -> NDArray[np.uint8]:
+    """Pixels of any depth as uint8, shape (H, W) or (H, W, 3) in RGB order; an alpha channel is dropped."""
+    if pixels.ndim == 3 and pixels.shape[2] <= 2:
+        pixels = pixels[..., 0]
+    if pixels.ndim == 3:
+        pixels = pixels[..., 2::-1] if bgr else pixels[..., :3]
+    if pixels.dtype == np.uint8:
+        return np.ascontiguousarray(pixels, dtype=np.uint8)
+    levels = pixels.astype(np.float64)
+    finite = levels[np.isfinite(levels)]
+    low, high = np.percentile(finite, _STRETCH_PERCENT) if finite.size else (0.0, 1.0)
+    scaled = (np.nan_to_num(levels, nan=low) - low) / max(high - low, 1e-12)
+    return np.asarray(np.rint(np.clip(scaled, 0, 1) * 255), dtype=np.uint8)
+
+
+def read_picture(path: Path) -> NDArray[np.uint8]:
+    """A PNG or JPEG file as uint8 picture, shape (H, W) or (H, W, 3) in RGB order."""
+    return to_picture(decode(read_bytes(path), str(path)), bgr=True)
+
+
+def read_depth_counts(path: Path) -> NDArray[np.uint16]:
+    """A depth PNG as stored, shape (H, W); only 16 bits and one channel hold depth."""
+    counts = decode(read_bytes(path), str(path))
+    if counts.dtype != np.uint16 or counts.ndim != 2:
+        channels = 1 if counts.ndim == 2 else counts.shape[2]
+        raise CaptureError(
+            f"{path}: expected a depth image of 16 bits and 1 channel, found {counts.dtype.itemsize * 8} bits and "
+            f"{channels} channel(s); record the raw depth, not a coloured picture of it"
+        )
+    return counts.astype(np.uint16, copy=False)
+
+
+def encode_png(pixels: NDArray[np.uint8] | NDArray[np.uint16]) -> bytes:
+    """PNG of a gray (H, W) or RGB (H, W, 3) picture, or of 16-bit depth; the same pixels give the same bytes."""
+    stored = pixels[..., ::-1] if pixels.ndim == 3 else pixels
+    done, data = cv2.imencode(".png", np.ascontiguousarray(stored), [cv2.IMWRITE_PNG_COMPRESSION, 6])
+    if not done:
+        raise ValueError(f"no PNG can be made of an array of shape {pixels.shape} and type {pixels.dtype}")
+    return bytes(data.tobytes())

@@ -1,0 +1,184 @@
+"""Frames written as an MCAP recording: ROS 2 `sensor_msgs` in CDR, compressed with zstd."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from mcap_ros2.writer import Writer
+from numpy.typing import NDArray
+
+from tubepose.capture.frame import CameraIntrinsics, RgbdFrame
+from tubepose.capture.images import encode_png
+from tubepose.capture.recording import METADATA_NAME
+from tubepose.capture.ros import CAMERA_INFO, COMPRESSED_IMAGE, IMAGE, POINT_CLOUD
+from tubepose.capture.writing import is_depth_image
+from tubepose.errors import CaptureError
+
+CLOUD_TOPIC = "/camera/points"
+DEPTH_TOPIC = "/camera/aligned_depth_to_color/image_raw"
+IMAGE_TOPIC = "/camera/color/image_raw"
+INFO_TOPIC = "/camera/color/camera_info"
+
+_FRAME_ID = "camera_color_optical_frame"
+_POINT_BYTES = 12
+# A float32 depth is exact to this, metres; a cloud that is farther from its lines of sight is not written as depth.
+_DEPTH_TOLERANCE_M = 1.0e-6
+
+_RULE = "=" * 80
+_HEADER = f"""
+{_RULE}
+MSG: std_msgs/Header
+builtin_interfaces/Time stamp
+string frame_id
+{_RULE}
+MSG: builtin_interfaces/Time
+int32 sec
+uint32 nanosec
+"""
+_DEFINITIONS = {
+    POINT_CLOUD: f"""std_msgs/Header header
+uint32 height
+uint32 width
+sensor_msgs/PointField[] fields
+bool is_bigendian
+uint32 point_step
+uint32 row_step
+uint8[] data
+bool is_dense
+{_RULE}
+MSG: sensor_msgs/PointField
+string name
+uint32 offset
+uint8 datatype
+uint32 count{_HEADER}""",
+    IMAGE: f"""std_msgs/Header header
+uint32 height
+uint32 width
+string encoding
+uint8 is_bigendian
+uint32 step
+uint8[] data{_HEADER}""",
+    COMPRESSED_IMAGE: f"""std_msgs/Header header
+string format
+uint8[] data{_HEADER}""",
+    CAMERA_INFO: f"""std_msgs/Header header
+uint32 height
+uint32 width
+string distortion_model
+float64[] d
+float64[9] k
+float64[9] r
+float64[12] p
+uint32 binning_x
+uint32 binning_y
+sensor_msgs/RegionOfInterest roi
+{_RULE}
+MSG: sensor_msgs/RegionOfInterest
+uint32 x_offset
+uint32 y_offset
+uint32 height
+uint32 width
+bool do_rectify{_HEADER}""",
+}
+
+
+def write_mcap(path: Path, frames: Iterable[RgbdFrame], *, as_depth: bool = False, compressed: bool = False) -> None:
+    """Write frames as one recording; the same frames give the same bytes.
+
+    Args:
+        path: The file; it is replaced only when all frames are written.
+        frames: One sensor's frames, in time order.
+        as_depth: Write depth images (32FC1, metres) instead of organised clouds of float32.
+        compressed: Write pictures as CompressedImage (PNG) instead of Image.
+
+    Raises:
+        CaptureError: `as_depth` for a frame without intrinsics, or with points off the lines of sight of their pixels.
+    """
+    path.parent.mkdir(parents=True, exist_ok=True)
+    aside = path.with_name(f".{path.name}.part")
+    try:
+        with aside.open("wb") as stream:
+            _write(stream, path, frames, as_depth, compressed)
+        aside.replace(path)
+    finally:
+        aside.unlink(missing_ok=True)
+
+
+def _write(stream: Any, path: Path, frames: Iterable[RgbdFrame], as_depth: bool, compressed: bool) -> None:
+    writer = Writer(stream)
+    schemas = {name: writer.register_msgdef(name, text) for name, text in _DEFINITIONS.items()}
+    for number, frame in enumerate(frames):
+        if number == 0:
+            noted = {"sensor": frame.sensor, "simulated": "true" if frame.simulated else "false"}
+            writer.add_metadata(METADATA_NAME, noted)
+        if as_depth and not is_depth_image(frame, _DEPTH_TOLERANCE_M):
+            raise CaptureError(
+                f"{path}: frame {number} cannot be written as a depth image; expected intrinsics and points on the "
+                "lines of sight of their pixels; write it as a cloud"
+            )
+        for topic, schema, message in _messages(frame, as_depth, compressed):
+            stamp = frame.timestamp_ns or 0
+            writer.write_message(topic, schemas[schema], message, log_time=stamp, publish_time=stamp, sequence=number)
+    writer.finish()  # type: ignore[no-untyped-call]
+
+
+def _messages(frame: RgbdFrame, as_depth: bool, compressed: bool) -> Iterable[tuple[str, str, dict[str, Any]]]:
+    """(topic, message type, message) of one frame, small ones first."""
+    seconds, nanoseconds = divmod(frame.timestamp_ns or 0, 1_000_000_000)
+    header = {"header": {"stamp": {"sec": seconds, "nanosec": nanoseconds}, "frame_id": _FRAME_ID}}
+    if frame.intrinsics is not None:
+        yield INFO_TOPIC, CAMERA_INFO, header | _info(frame.intrinsics)
+    if frame.image is not None and compressed:
+        encoding = "rgb8" if frame.image.ndim == 3 else "mono8"
+        shot = {
+            "format": f"{encoding}; png compressed {encoding.replace('rgb', 'bgr')}",
+            "data": encode_png(frame.image),
+        }
+        yield f"{IMAGE_TOPIC}/compressed", COMPRESSED_IMAGE, header | shot
+    elif frame.image is not None:
+        yield IMAGE_TOPIC, IMAGE, header | _image(frame.image, "rgb8" if frame.image.ndim == 3 else "mono8")
+    if as_depth:
+        yield DEPTH_TOPIC, IMAGE, header | _image(frame.cloud_m[..., 2].astype("<f4"), "32FC1")
+    else:
+        yield CLOUD_TOPIC, POINT_CLOUD, header | _cloud(frame)
+
+
+def _image(pixels: NDArray[Any], encoding: str) -> dict[str, Any]:
+    height, width = pixels.shape[:2]
+    data = np.ascontiguousarray(pixels).tobytes()
+    step = len(data) // height
+    return {"height": height, "width": width, "encoding": encoding, "is_bigendian": 0, "step": step, "data": data}
+
+
+def _cloud(frame: RgbdFrame) -> dict[str, Any]:
+    height, width = frame.cloud_m.shape[:2]
+    fields = [{"name": axis, "offset": 4 * i, "datatype": 7, "count": 1} for i, axis in enumerate("xyz")]
+    return {
+        "height": height,
+        "width": width,
+        "fields": fields,
+        "is_bigendian": False,
+        "point_step": _POINT_BYTES,
+        "row_step": _POINT_BYTES * width,
+        "data": frame.cloud_m.astype("<f4").tobytes(),
+        "is_dense": False,
+    }
+
+
+def _info(camera: CameraIntrinsics) -> dict[str, Any]:
+    k = [camera.fx, 0.0, camera.cx, 0.0, camera.fy, camera.cy, 0.0, 0.0, 1.0]
+    return {
+        "height": camera.height,
+        "width": camera.width,
+        "distortion_model": "plumb_bob",
+        "d": [0.0] * 5,
+        "k": k,
+        "r": [1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0],
+        "p": [*k[0:3], 0.0, *k[3:6], 0.0, *k[6:9], 0.0],
+        "binning_x": 0,
+        "binning_y": 0,
+        "roi": {},
+    }

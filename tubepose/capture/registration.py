@@ -1,0 +1,107 @@
+"""Clouds made ready for the estimators: units, invalid points, and the projection into an image's pixels.
+
+The paper's assumption 3 wants every pixel to have its point. Where a sensor does not give that, the recorded
+calibration does: `project_cloud` puts the cloud into the image's grid.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from tubepose.capture.frame import CameraIntrinsics
+from tubepose.transforms import FloatArray, transform_points
+
+METRES_PER_UNIT = {"m": 1.0, "mm": 1.0e-3}
+
+# An organised cloud whose points miss their pixels by more than this is no pinhole image of its camera frame.
+_MAX_RESIDUAL_PX = 1.0
+_MIN_POINTS = 100
+
+
+def clean_cloud(xyz: ArrayLike, metres_per_unit: float) -> FloatArray:
+    """Coordinates in metres, with NaN for every invalid point.
+
+    Sensors mark a missing point by NaN (Zivid, ROS) or by (0, 0, 0) (PhoXi); both come out as NaN.
+
+    Args:
+        xyz: Array of shape (..., 3) in the source's unit.
+        metres_per_unit: 1 for metres, 0.001 for millimetres.
+    """
+    points = np.array(xyz, dtype=np.float64)
+    invalid = ~np.isfinite(points).all(axis=-1) | (points == 0).all(axis=-1)
+    points *= metres_per_unit
+    points[invalid] = np.nan
+    return points
+
+
+def depth_to_metres(counts: NDArray[np.generic], metres_per_count: float) -> FloatArray:
+    """Depth (H, W) in metres from counts; zero, negative, non-finite and 65535 of 16 bits (overflow) become NaN."""
+    depth = counts.astype(np.float64) * metres_per_count
+    invalid = ~(np.isfinite(depth) & (depth > 0))
+    if counts.dtype.kind == "u":
+        invalid |= counts == np.iinfo(np.uint16).max
+    depth[invalid] = np.nan
+    return depth
+
+
+def project_cloud(points_m: FloatArray, T_image_cloud: FloatArray, intrinsics: CameraIntrinsics) -> FloatArray:
+    """Organise a cloud by the pixels of an image: a z-buffer in which the nearest point wins.
+
+    Args:
+        points_m: Array of shape (..., 3), frame of the cloud, metres.
+        T_image_cloud: Array of shape (4, 4); maps cloud points to the image's camera frame, metres.
+        intrinsics: Of the image.
+
+    Returns:
+        Array of shape (H, W, 3), camera frame of the image, metres. Points keep their measured coordinates: they are
+        not moved to the pixel's centre. NaN where no point falls. Points that the image cannot see but that no
+        nearer point covers stay.
+    """
+    points = transform_points(T_image_cloud, points_m.reshape(-1, 3))
+    points = points[np.isfinite(points).all(axis=1)]
+    uv = np.rint(intrinsics.project(points))
+    size = (intrinsics.width, intrinsics.height)
+    inside = (uv >= 0).all(axis=1) & (uv < size).all(axis=1)
+    points, uv = points[inside], uv[inside].astype(np.intp)
+    pixel = uv[:, 1] * intrinsics.width + uv[:, 0]
+    # Far to near: of several points in one pixel NumPy keeps the last that is assigned.
+    order = np.argsort(-points[:, 2], kind="stable")
+    organised = np.full((intrinsics.height * intrinsics.width, 3), np.nan)
+    organised[pixel[order]] = points[order]
+    return organised.reshape(intrinsics.height, intrinsics.width, 3)
+
+
+def estimate_intrinsics(cloud_m: FloatArray) -> CameraIntrinsics | None:
+    """Pinhole intrinsics that an organised cloud implies: least squares of u on X/Z and of v on Y/Z.
+
+    Args:
+        cloud_m: Array of shape (H, W, 3), camera frame, metres, NaN for invalid pixels.
+
+    Returns:
+        The intrinsics, or None where the cloud is no pinhole image: fewer than 100 points in front of the camera,
+        points on one line of sight, or an RMS residual above 1 px along u or v.
+    """
+    height, width = cloud_m.shape[:2]
+    v, u = np.nonzero(np.isfinite(cloud_m).all(axis=-1) & (np.nan_to_num(cloud_m[..., 2]) > 0))
+    if len(u) < _MIN_POINTS:
+        return None
+    points = cloud_m[v, u]
+    horizontal = _fit_line(points[:, 0] / points[:, 2], u)
+    vertical = _fit_line(points[:, 1] / points[:, 2], v)
+    if horizontal is None or vertical is None:
+        return None
+    return CameraIntrinsics(width, height, horizontal[0], vertical[0], horizontal[1], vertical[1])
+
+
+def _fit_line(tangent: FloatArray, pixel: NDArray[np.intp]) -> tuple[float, float] | None:
+    """Focal length and principal point of one axis, pixels; None where the fit is no camera."""
+    t, p = tangent - tangent.mean(), pixel - pixel.mean()
+    spread = float(t @ t)
+    if spread <= 0:
+        return None
+    focal = float(t @ p) / spread
+    rms = float(np.sqrt(np.mean((p - focal * t) ** 2)))
+    if focal <= 0 or rms > _MAX_RESIDUAL_PX:
+        return None
+    return focal, float(pixel.mean() - focal * tangent.mean())

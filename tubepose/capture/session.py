@@ -1,0 +1,141 @@
+"""A session folder: trials that tie captures with printed caps to captures with original caps.
+
+`session.yaml` is written by a person or by the simulator; docs/capture-format.md describes it.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Literal
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from tubepose.errors import CaptureError, LabwareError
+from tubepose.labware import CapModel, RackModel, TubeModel, load_cap, load_rack, load_tube
+from tubepose.labware.reading import read_yaml, validate
+
+SESSION_FILE = "session.yaml"
+
+
+class SlotHint(BaseModel):
+    """Where a slot is seen in the image: tells the two turns of a symmetric rack apart.
+
+    Attributes:
+        slot: Name of the slot.
+        pixel: Its place (u, v) in the image; a click is exact enough.
+    """
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+    slot: str
+    pixel: tuple[float, float]
+
+
+class Trial(BaseModel):
+    """One placement of tubes, scanned twice with the tubes unmoved.
+
+    Attributes:
+        name: Unique in its session.
+        tubes: Tube (name or file) per occupied slot.
+        original: Capture with the original caps, relative to the session folder.
+        printed: Capture with the printed caps, or None where there is no ground truth.
+        hint: Which way round the rack stands, if that was noted.
+    """
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+    name: str = Field(min_length=1)
+    tubes: dict[str, str]
+    original: str
+    printed: str | None = None
+    hint: SlotHint | None = None
+
+
+class _SessionFile(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True)
+    format: Literal[1]
+    name: str = Field(min_length=1)
+    origin: Literal["recorded", "simulated"]
+    sensor: str = "unknown"
+    rack: str
+    printed_cap: str | None = None
+    trials: tuple[Trial, ...] = Field(min_length=1)
+
+
+class Session(BaseModel):
+    """A session with its labware loaded.
+
+    Attributes:
+        folder: Where `session.yaml` lies.
+        rack: The rack of every trial.
+        printed_cap: The printed cap, or None where no trial has one.
+        tubes: Every tube model that the trials name, by the name that they use.
+    """
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+    folder: Path
+    name: str
+    origin: Literal["recorded", "simulated"]
+    sensor: str
+    rack: RackModel
+    printed_cap: CapModel | None
+    tubes: dict[str, TubeModel]
+    trials: tuple[Trial, ...]
+
+    def tubes_of(self, trial: Trial) -> tuple[TubeModel, ...]:
+        """The kinds of tube in a trial, each once, in a fixed order."""
+        return tuple(self.tubes[name] for name in sorted(set(trial.tubes.values())))
+
+
+def is_session(path: Path) -> bool:
+    """True when the folder holds a `session.yaml`."""
+    return (path / SESSION_FILE).is_file()
+
+
+def load_session(path: Path) -> Session:
+    """Read a session folder (or its `session.yaml`) and the labware that it names.
+
+    Raises:
+        CaptureError: No session there, or one that breaks the format.
+        LabwareError: It names labware that does not exist.
+    """
+    folder = path.parent if path.name == SESSION_FILE else path
+    file = folder / SESSION_FILE
+    if not file.is_file():
+        raise CaptureError(f"{path}: no {SESSION_FILE} found; docs/capture-format.md shows how to write one")
+    data = validate(_SessionFile, read_yaml(file, CaptureError), str(file), CaptureError)
+    try:
+        rack = load_rack(data.rack, folder)
+        cap = load_cap(data.printed_cap, folder) if data.printed_cap is not None else None
+        tubes = {name: load_tube(name, folder) for trial in data.trials for name in trial.tubes.values()}
+    except LabwareError as problem:
+        raise LabwareError(f"{file}: {problem}") from None
+    _check_trials(file, data, rack)
+    return Session(
+        folder=folder,
+        name=data.name,
+        origin=data.origin,
+        sensor=data.sensor,
+        rack=rack,
+        printed_cap=cap,
+        tubes=tubes,
+        trials=data.trials,
+    )
+
+
+def _check_trials(file: Path, data: _SessionFile, rack: RackModel) -> None:
+    names = [trial.name for trial in data.trials]
+    doubled = sorted({name for name in names if names.count(name) > 1})
+    if doubled:
+        raise CaptureError(f"{file}: trial names must be unique, found twice: {', '.join(doubled)}")
+    known = {slot.name for slot in rack.all_slots}
+    for trial in data.trials:
+        named = set(trial.tubes) | ({trial.hint.slot} if trial.hint is not None else set())
+        unknown = sorted(named - known)
+        if unknown:
+            raise CaptureError(
+                f"{file}: trial {trial.name}: no slot {', '.join(unknown)} in rack {rack.name}; "
+                f"its slots run from {rack.all_slots[0].name} to {rack.all_slots[-1].name}"
+            )
+        if trial.printed is not None and data.printed_cap is None:
+            raise CaptureError(
+                f"{file}: trial {trial.name} has a printed capture, but the session names no printed_cap"
+            )

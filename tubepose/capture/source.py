@@ -1,0 +1,168 @@
+"""One way to open whatever was recorded: `open_captures`."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal, Protocol
+
+from tubepose.capture.description import Unit
+from tubepose.capture.folder import FolderCapture, PlyCapture, is_capture_folder
+from tubepose.capture.frame import RgbdFrame
+from tubepose.capture.mcap import McapCapture
+from tubepose.capture.topics import TopicChoice
+from tubepose.errors import CaptureError
+
+# Truth of a simulated session: nothing that an estimator may read.
+TRUTH_FOLDER = "simulation_truth"
+
+_CONVERT = {
+    ".bag": "a ROS 1 bag; convert it: pip install rosbags, then rosbags-convert, then ros2 bag convert to MCAP "
+    "(or 'mcap convert in.bag out.mcap'); a RealSense .bag: rs-convert -p for PLY",
+    ".db3": "a ROS 2 bag in SQLite; convert it with 'mcap convert in.db3 out.mcap' or 'ros2 bag convert'",
+    ".zdf": "a Zivid frame; save it as PLY in Zivid Studio, or frame.save('cloud.ply') with the Zivid SDK (unit: mm)",
+    ".praw": "a PhoXi raw frame; open it in PhoXi Control and save it as PLY, organised, with texture (unit: mm)",
+    ".ptx": "a PTX cloud; save it as PLY in PhoXi Control, organised (unit: mm)",
+    ".pcd": "a PCL cloud; convert it with pcl_pcd2ply or open3d.io.write_point_cloud('cloud.ply', ...)",
+}
+
+
+class Capture(Protocol):
+    """Something recorded: one frame or many.
+
+    Attributes:
+        name: As the tables show it.
+        path: Where it lies.
+    """
+
+    @property
+    def name(self) -> str:
+        """As the tables show it."""
+        ...
+
+    @property
+    def path(self) -> Path:
+        """Folder or file."""
+        ...
+
+    def frames(self) -> Iterator[RgbdFrame]:
+        """Yield the frames one by one.
+
+        Raises:
+            CaptureError: The content is missing, cut, or not what it claims to be; frames before it were good.
+        """
+        ...
+
+
+@dataclass(frozen=True, slots=True)
+class UnreadableCapture:
+    """A file of a known format that is not read: it keeps its row among the captures, with what to do about it."""
+
+    name: str
+    path: Path
+
+    def frames(self) -> Iterator[RgbdFrame]:
+        """Yield nothing.
+
+        Raises:
+            CaptureError: Always; says how to convert the file.
+        """
+        raise CaptureError(f"{self.path}: {_CONVERT[self.path.suffix.lower()]}")
+        yield
+
+
+def open_captures(
+    path: Path,
+    *,
+    unit: str | None = None,
+    cloud_topic: str | None = None,
+    image_topic: str | None = None,
+    depth_topic: str | None = None,
+    info_topic: str | None = None,
+) -> list[Capture]:
+    """Find the captures at a path; nothing of their content is read yet.
+
+    Args:
+        path: A capture folder, a PLY file, an MCAP file, or a directory that is searched for them, in sorted order.
+        unit: ``m`` or ``mm``, unit of clouds: goes before `capture.yaml`; without either a cloud is in metres. Depth
+            images keep their own scale.
+        cloud_topic: PointCloud2 topic of MCAP files.
+        image_topic: Image or CompressedImage topic of MCAP files.
+        depth_topic: Topic of depth images of MCAP files.
+        info_topic: CameraInfo topic of MCAP files.
+
+    Returns:
+        Captures in sorted order. One is named after its folder or file; those of a directory by their path.
+
+    Raises:
+        CaptureError: No such path, nothing to open there, or a unit that is none.
+    """
+    opener = _Opener(_unit(unit), TopicChoice(cloud_topic, image_topic, depth_topic, info_topic))
+    if not path.exists():
+        raise CaptureError(f"{path}: no such file or folder")
+    if path.is_file() or is_capture_folder(path):
+        capture = opener.open(path, path.stem if path.is_file() else path.resolve().name)
+        if capture is not None:
+            return [capture]
+        raise CaptureError(
+            f"{path}: expected a capture folder, or a file ending in .ply or .mcap, found '{path.suffix}'"
+        )
+    return _search(path, opener)
+
+
+@dataclass(frozen=True, slots=True)
+class _Opener:
+    unit: Unit | None
+    topics: TopicChoice
+
+    def open(self, path: Path, name: str) -> Capture | None:
+        if path.is_dir():
+            return FolderCapture(name, path, self.unit)
+        suffix = path.suffix.lower()
+        if suffix == ".ply":
+            return PlyCapture(name, path, self.unit)
+        if suffix == ".mcap":
+            return McapCapture(name, path, self.unit, self.topics)
+        return UnreadableCapture(name, path) if suffix in _CONVERT else None
+
+
+def _search(path: Path, opener: _Opener) -> list[Capture]:
+    places = list(_walk(path))
+    names = _names(path, places)
+    found = [opener.open(place, name) for place, name in zip(places, names, strict=True)]
+    captures = [capture for capture in found if capture is not None]
+    if not captures:
+        raise CaptureError(
+            f"{path}: no capture found; looked in it and below for folders with capture.yaml, cloud.ply or depth.png, "
+            "and for .ply and .mcap files; docs/capture-format.md shows how to record one"
+        )
+    return captures
+
+
+def _unit(unit: str | None) -> Unit | None:
+    known: dict[str | None, Literal["m", "mm"] | None] = {None: None, "m": "m", "mm": "mm"}
+    if unit not in known:
+        raise CaptureError(f"unit '{unit}' is not known; expected m or mm")
+    return known[unit]
+
+
+def _walk(folder: Path) -> Iterator[Path]:
+    """Capture folders and files below a folder, sorted; a capture folder is not searched further."""
+    for entry in sorted(folder.iterdir()):
+        if entry.name.startswith(".") or entry.name == TRUTH_FOLDER:
+            continue
+        if entry.is_dir() and not is_capture_folder(entry):
+            yield from _walk(entry)
+        else:
+            yield entry
+
+
+def _names(root: Path, places: list[Path]) -> list[str]:
+    """Path below the root without ending; with it where two would have the same name."""
+    full = [place.relative_to(root).as_posix() for place in places]
+    short = [
+        place.relative_to(root).with_suffix("").as_posix() if place.is_file() else name
+        for place, name in zip(places, full, strict=True)
+    ]
+    return [name if short.count(name) == 1 else whole for name, whole in zip(short, full, strict=True)]
