@@ -1,0 +1,138 @@
+"""Boxes without a network: the height band of the rack's top, and what stands above it, parted by the slots."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from tubepose.capture.frame import RgbdFrame
+from tubepose.config import Config
+from tubepose.detection.model import RACK_CLASS, TUBE_CLASS, Detection
+from tubepose.labware import RackModel, TubeModel
+from tubepose.preprocessing import TALLEST_TUBE_M, RackTop, find_rack_top
+from tubepose.transforms import FloatArray, invert_transform, transform_points
+
+CELL_M = 5e-4
+
+
+@dataclass(frozen=True)
+class GeometricDetector:
+    """Detector that knows the rack's definition and sees only the cloud.
+
+    Attributes:
+        rack: The rack that is looked for.
+        tubes: The kinds of tube that can stand in it: their heights and radii part touching caps.
+        config: Sections rack_top, slots and preprocess are used.
+    """
+
+    rack: RackModel
+    tubes: tuple[TubeModel, ...] = ()
+    config: Config = field(default_factory=Config)
+    name: str = "geometric"
+
+    def detect(self, frame: RgbdFrame) -> tuple[Detection, ...]:
+        """One rack, and a ``tube`` for every group of points that stands on it.
+
+        Where no band fits the rack, the whole cloud is returned as a rack of score 0, so that the registration can say
+        what is wrong with it.
+        """
+        rows = np.flatnonzero(frame.valid)
+        points = frame.points_m[rows]
+        top = find_rack_top(points, self.rack, self.config.rack_top) if len(points) >= 50 else None
+        if top is None or not top.fits(self.config.rack_top):
+            return (self._detection(frame, RACK_CLASS, 0.0, rows, rows),)
+        local = transform_points(invert_transform(top.T_camera_top), points)
+        margin = 5e-3
+        near = np.all(np.abs(local[:, :2]) < np.array(top.size_m) / 2 + margin, axis=1)
+        on_rack = near & (local[:, 2] > -self.rack.height_m) & (local[:, 2] < TALLEST_TUBE_M)
+        found = [self._detection(frame, RACK_CLASS, 1.0, rows[on_rack], rows[top.band_rows])]
+        standing = on_rack & (local[:, 2] > self.config.slots.clearance_m)
+        labels = self._part(local[standing], self.rack.slot_centers_m)
+        for label in range(labels.max(initial=-1) + 1):
+            members = rows[standing][labels == label]
+            found.append(self._detection(frame, TUBE_CLASS, 1.0, members, members))
+        return tuple(found)
+
+    def _part(self, points_m: FloatArray, centers_m: FloatArray) -> NDArray[np.intp]:
+        """Label of every standing point (N, 3), frame of the top; shape (N,), -1 for points of no tube.
+
+        Caps and rims are discs at known heights that cannot overlap: they are found one by one where a disc of their
+        radius covers most points. What stands on a slot without such a top is a group too: a tube of unknown kind.
+        """
+        if len(points_m) == 0:
+            return np.empty(0, np.intp)
+        xy = points_m[:, :2]
+        pitch_m = float(np.median(_nearest_pitch(centers_m)))
+        radius_m = max((tube.max_radius_m for tube in self.tubes), default=pitch_m / 2)
+        tops = np.zeros(len(xy), bool)
+        for tube in self.tubes:
+            height_m = self.rack.floor_m + tube.height_m - self.rack.height_m
+            tops |= np.abs(points_m[:, 2] - height_m) < self.config.slots.top_band_m
+        found = _cover_by_discs(xy[tops], radius_m, self.config.preprocess.min_tube_points)
+        explained = np.zeros(len(xy), bool)
+        if len(found):
+            explained = cKDTree(found).query(xy)[0] < 1.5 * radius_m
+        nearest_m, slot = cKDTree(centers_m).query(xy)
+        loose = ~explained & (nearest_m < 0.35 * pitch_m)
+        counts = np.bincount(slot[loose], minlength=len(centers_m))
+        unknown = counts >= 2 * self.config.preprocess.min_tube_points
+        middles = np.vstack([found, centers_m[unknown]])
+        if len(middles) == 0:
+            return np.full(len(xy), -1)
+        distance, label = cKDTree(middles).query(xy)
+        return np.where(distance < 1.5 * radius_m, label, -1)
+
+    @staticmethod
+    def _detection(
+        frame: RgbdFrame, class_name: str, score: float, rows: NDArray[np.intp], box_rows: NDArray[np.intp]
+    ) -> Detection:
+        box = (float("nan"),) * 4
+        if frame.organised and len(box_rows):
+            v, u = np.divmod(box_rows, frame.cloud_m.shape[1])
+            box = (float(u.min()), float(v.min()), float(u.max()), float(v.max()))
+        return Detection(class_name, score, box, "geometric", rows)
+
+
+def _nearest_pitch(centers_m: FloatArray) -> FloatArray:
+    """Distance of every slot to its nearest neighbour, shape (S,), metres; a lone slot counts 20 mm."""
+    if len(centers_m) == 1:
+        return np.array([0.02])
+    return np.asarray(cKDTree(centers_m).query(centers_m, k=2)[0][:, 1])
+
+
+def _cover_by_discs(xy_m: FloatArray, radius_m: float, min_points: int) -> FloatArray:
+    """Centres of discs, shape (K, 2), that cover points (N, 2) one disc after the other, the fullest first.
+
+    Stops at a disc with less than `min_points` or a quarter of the points of the fullest one: slivers of mixed pixels.
+    """
+    if len(xy_m) < min_points:
+        return np.empty((0, 2))
+    reach = int(np.ceil(radius_m / CELL_M))
+    low = xy_m.min(axis=0)
+    cells = np.rint((xy_m - low) / CELL_M).astype(np.intp) + reach
+    raster = np.zeros(cells.max(axis=0) + reach + 1, np.float32)
+    np.add.at(raster, (cells[:, 0], cells[:, 1]), 1)
+    offsets = np.arange(-reach, reach + 1) * CELL_M
+    square = np.hypot(*np.meshgrid(offsets, offsets))
+    kernel = np.where(square <= radius_m, 1.0, 0.0).astype(np.float32)
+    centers: list[FloatArray] = []
+    fullest = 0.0
+    rows, columns = np.indices(raster.shape)
+    while True:
+        score = cv2.filter2D(raster, cv2.CV_32F, kernel, borderType=cv2.BORDER_CONSTANT)
+        count = float(score.max())
+        fullest = max(fullest, count)
+        if count < max(min_points, 0.25 * fullest):
+            break
+        # Several places cover the same points: take their middle.
+        best = np.argwhere(score >= count - 0.5)
+        near = best[np.hypot(*(best - best[0]).T) < reach]
+        center = near.mean(axis=0)
+        covered = np.hypot(rows - center[0], columns - center[1]) <= (radius_m + 1.5e-3) / CELL_M
+        raster[covered] = 0
+        centers.append((center - reach) * CELL_M + low)
+    return np.array(centers).reshape(-1, 2)

@@ -1,0 +1,69 @@
+"""What every source of boxes returns, and what it must offer (paper, section III)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tubepose.capture.frame import RgbdFrame
+
+RACK_CLASS = "rack"
+TUBE_CLASS = "tube"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Detection:
+    """One detected object.
+
+    Attributes:
+        class_name: The detector's word: ``rack``, ``tube`` (a tube of unknown type), or a class of a labware file.
+        score: 0 to 1; 1 for a recorded box.
+        box_xyxy_px: Left, top, right, bottom in pixels, edges included; NaN where the cloud has no pixels.
+        source: ``yolo``, ``recorded`` or ``geometric``.
+        point_rows: Rows of `RgbdFrame.points_m` that belong to the object, where the detector knows them (geometric);
+            None means every point in the box.
+    """
+
+    class_name: str
+    score: float
+    box_xyxy_px: tuple[float, float, float, float]
+    source: str
+    point_rows: NDArray[np.intp] | None = None
+
+    @property
+    def is_rack(self) -> bool:
+        """True for a rack; every other class is a tube."""
+        return self.class_name == RACK_CLASS
+
+
+class Detector(Protocol):
+    """A source of boxes."""
+
+    name: str
+
+    def detect(self, frame: RgbdFrame) -> tuple[Detection, ...]:
+        """Find racks and tubes in a frame.
+
+        Raises:
+            DetectorError: The detector cannot work on this frame at all (a network without an image, say).
+        """
+        ...
+
+
+def rows_in_box(frame: RgbdFrame, detection: Detection) -> NDArray[np.intp]:
+    """Rows of `RgbdFrame.points_m` that a detection selects, valid points only."""
+    if detection.point_rows is not None:
+        return _valid_rows(frame, detection.point_rows)
+    height, width = frame.cloud_m.shape[:2]
+    left, top, right, bottom = detection.box_xyxy_px
+    u0, u1 = int(np.clip(np.floor(left), 0, width)), int(np.clip(np.ceil(right) + 1, 0, width))
+    v0, v1 = int(np.clip(np.floor(top), 0, height)), int(np.clip(np.ceil(bottom) + 1, 0, height))
+    grid = np.arange(v0, v1)[:, None] * width + np.arange(u0, u1)[None, :]
+    return _valid_rows(frame, grid.reshape(-1))
+
+
+def _valid_rows(frame: RgbdFrame, rows: NDArray[np.intp]) -> NDArray[np.intp]:
+    return np.asarray(rows[np.isfinite(frame.points_m[rows, 2])], np.intp)
