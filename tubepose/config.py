@@ -1,0 +1,182 @@
+"""Every tunable number of the estimators: one frozen section per stage, defaults beside the reason for them.
+
+A user's YAML file (``--config``) may set any of them; an unknown key fails and names the known ones.
+None of the defaults was fitted to a capture that a table of ours is computed on; docs/method.md says where each is from.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Literal
+
+from pydantic import BaseModel, ConfigDict
+
+from tubepose.errors import ConfigError
+from tubepose.labware.reading import read_yaml, validate
+
+Objective = Literal["hinge", "signed", "l1", "l2", "count"]
+
+
+class _Section(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class PreprocessConfig(_Section):
+    """Outlier removal and down-sampling (paper, section III and Table II, note 3).
+
+    Attributes:
+        outlier_neighbors: Neighbours per point of the statistical outlier removal.
+        outlier_std_ratio: A point farther from its neighbours than mean + ratio * std is removed.
+        rack_voxel_m: Voxel of the rack's points before registration.
+        tube_max_points: Points per tube that the fits see (evenly thinned beyond that).
+        min_tube_points: Fewer points than this above a slot are not a tube.
+    """
+
+    outlier_neighbors: int = 20
+    outlier_std_ratio: float = 2.0
+    rack_voxel_m: float = 1.0e-3
+    tube_max_points: int = 400
+    min_tube_points: int = 25
+
+
+class RackTopConfig(_Section):
+    """Finding the height band of the rack's top (detector ``geometric`` and the rack's registration).
+
+    Attributes:
+        plane_distance_m: RANSAC inlier distance of the first plane (table, or the top itself).
+        plane_iterations: RANSAC iterations.
+        max_planes: How many dominant planes are tried as "level".
+        bin_m: Bin of the height histogram.
+        band_m: Half thickness of the band about a histogram peak.
+        outline_tolerance_m: Allowed difference of the measured and the defined outline, per side.
+        max_in_slot_share: Largest share of the band in the rack's openings; the slots' floor has nearly all of it there.
+        search_points: Points of the cloud that the search sees, evenly thinned.
+        seed: Seed of the RANSAC.
+    """
+
+    plane_distance_m: float = 2.0e-3
+    plane_iterations: int = 300
+    max_planes: int = 3
+    bin_m: float = 5.0e-4
+    band_m: float = 2.0e-3
+    outline_tolerance_m: float = 5.0e-3
+    max_in_slot_share: float = 0.3
+    search_points: int = 100_000
+    seed: int = 0
+
+
+class RackConfig(_Section):
+    """Registration of the rack (paper, section IV-A).
+
+    Attributes:
+        template_spacing_m: Grid of the template of the top surface.
+        icp_distances_m: Correspondence distance of each ICP round, coarse to fine.
+        icp_iterations: Iterations per round.
+        judge_distance_m: Correspondence distance at which fitness and rmse of the result are stated and judged.
+        max_inlier_rmse_m: A larger inlier rmse is no rack (a real scan of the right rack reaches 1.0 mm).
+        min_fitness: Smallest share of the scan's top points with a correspondence.
+        slot_margin_m: A point farther than this inside an opening contradicts the template.
+        max_in_slot_share: Largest share of such points: fitness alone accepts a rack of another pitch.
+        min_coverage: Smallest share of the template that is seen.
+        ambiguous_margin_m: Two turns whose rmse differ by less are not told apart by geometry.
+        max_spacing_ratio: Largest point spacing, in units of the rack's narrowest rib: coarser captures are insufficient.
+    """
+
+    template_spacing_m: float = 5.0e-4
+    icp_distances_m: tuple[float, ...] = (6.0e-3, 3.0e-3, 1.2e-3)
+    icp_iterations: int = 60
+    judge_distance_m: float = 3.0e-3
+    max_inlier_rmse_m: float = 1.1e-3
+    min_fitness: float = 0.9
+    slot_margin_m: float = 1.5e-3
+    max_in_slot_share: float = 0.04
+    min_coverage: float = 0.25
+    ambiguous_margin_m: float = 5.0e-5
+    max_spacing_ratio: float = 1.0
+
+
+class SlotConfig(_Section):
+    """Which slot holds which tube (paper, section IV-B).
+
+    Attributes:
+        top_band_m: Points this near the height of a known tube's top are its cap or rim (detector ``geometric``).
+        clearance_m: Points must stand this far above the rack's top to be a tube's.
+        reach_m: How far beyond a tube's largest radius its points may lie from its slot's axis at the top: the lean.
+        min_share: Smallest share of the projected hull's area for a slot to hold the tube.
+        height_tolerance_m: Largest difference between a tube's measured and defined height when types are told by height.
+    """
+
+    top_band_m: float = 2.5e-3
+    clearance_m: float = 4.0e-3
+    reach_m: float = 4.0e-3
+    min_share: float = 0.2
+    height_tolerance_m: float = 2.5e-3
+
+
+class TubeConfig(_Section):
+    """The cylinder fit about the slot's bottom centre (paper, Eqs. 1 to 5).
+
+    Attributes:
+        objective: Cost of Eq. 3: ``hinge`` sum max(D - r, 0); ``signed`` sum (D - r), as printed; ``l1``; ``l2``;
+            ``count`` of D > r, as in the authors' own program.
+        max_tilt_rad: Bound of alpha and beta in the search.
+        tolerance_m: Added to the clearance of Eq. 5, beside the rack's own floor play, for the fit's error at the rack's top.
+        min_points: Fewer points reject the tube.
+    """
+
+    objective: Objective = "hinge"
+    max_tilt_rad: float = 0.0872665
+    tolerance_m: float = 5.0e-4
+    min_points: int = 25
+
+
+class IcpConfig(_Section):
+    """The rivals' registration (paper, section V-B): Open3D, same points, settings printed with the tables.
+
+    Attributes:
+        template_points: Points sampled from the visible part of the tube's profile.
+        max_distance_m: Correspondence distances of the ICP rounds, coarse to fine.
+        iterations: Iterations per round.
+        estimation: Point-to-plane or point-to-point.
+        voxel_m: Voxel of the global registration.
+        normal_radius_m: Radius of the normals.
+        feature_radius_m: Radius of the FPFH features.
+        mutual_filter: Keep only feature pairs that are each other's nearest.
+        ransac_distance_m: Inlier distance of the RANSAC.
+        ransac_iterations: Most RANSAC iterations.
+        ransac_confidence: RANSAC stops at this confidence.
+    """
+
+    template_points: int = 2000
+    max_distance_m: tuple[float, ...] = (4.0e-3, 1.5e-3)
+    iterations: int = 50
+    estimation: Literal["point_to_plane", "point_to_point"] = "point_to_plane"
+    voxel_m: float = 1.0e-3
+    normal_radius_m: float = 3.0e-3
+    feature_radius_m: float = 6.0e-3
+    mutual_filter: bool = False
+    ransac_distance_m: float = 1.5e-3
+    ransac_iterations: int = 100_000
+    ransac_confidence: float = 0.999
+
+
+class Config(_Section):
+    """All sections."""
+
+    preprocess: PreprocessConfig = PreprocessConfig()
+    rack_top: RackTopConfig = RackTopConfig()
+    rack: RackConfig = RackConfig()
+    slots: SlotConfig = SlotConfig()
+    tube: TubeConfig = TubeConfig()
+    icp: IcpConfig = IcpConfig()
+
+
+def load_config(path: Path | None) -> Config:
+    """Defaults, changed by the YAML file if one is given.
+
+    Raises:
+        ConfigError: The file is missing, or has an unknown key or a wrong value.
+    """
+    if path is None:
+        return Config()
+    return validate(Config, read_yaml(path, ConfigError), str(path), ConfigError)

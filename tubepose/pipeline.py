@@ -1,0 +1,239 @@
+"""The stages in the paper's order, each timed: detection, rack, slots, tube."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+
+
+from tubepose.baselines import fit_global_icp, fit_slot_icp, fit_upright
+from tubepose.capture.frame import CameraIntrinsics, RgbdFrame
+from tubepose.capture.registration import estimate_intrinsics
+from tubepose.capture.session import SlotHint
+from tubepose.config import Config
+from tubepose.detection import Detection, Detector, rows_in_box
+from tubepose.labware import RackModel, TubeModel
+from tubepose.preprocessing import remove_outliers
+from tubepose.rack import RackPose, RackStatus, register_rack
+from tubepose.slots import SlotAssignment, assign_slots, crop_to_slot, identify_tube
+from tubepose.transforms import FloatArray, invert_transform, transform_points
+from tubepose.tube import TubeMethod, TubePose, TubeStatus, fit_tube
+
+METHODS: Mapping[str, TubeMethod] = {
+    "paper": fit_tube,
+    "upright": fit_upright,
+    "slot-icp": fit_slot_icp,
+    "global-icp": fit_global_icp,
+}
+STOCHASTIC = frozenset({"global-icp"})
+DEFAULT_METHOD = "paper"
+
+
+@dataclass(frozen=True, slots=True)
+class StageTime:
+    """How long one instance of a stage took.
+
+    Attributes:
+        stage: ``load``, ``detect``, ``rack``, ``slots`` or ``tube``.
+        method: The tube method, or ``all`` for a stage that every method shares.
+        instance: The slot for a tube, else empty.
+        seed: Seed of a stochastic method, else None.
+        duration_ms: Wall time, milliseconds.
+    """
+
+    stage: str
+    method: str
+    instance: str
+    seed: int | None
+    duration_ms: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TubeTarget:
+    """A detected tube, ready for any method.
+
+    Attributes:
+        detection: Index of the detection.
+        slot: Name of the slot, or None.
+        tube: The tube's model, or None where its type is unknown.
+        share: Share of its projected hull in the slot's opening.
+        reason: Why no method can be asked; empty otherwise.
+        points_m: Points after outlier removal, rack frame, shape (N, 3), metres.
+    """
+
+    detection: int
+    slot: str | None
+    tube: TubeModel | None
+    share: float
+    reason: str
+    points_m: FloatArray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Scene:
+    """What all methods share of one frame: boxes, rack, slots.
+
+    Attributes:
+        frame: The frame.
+        rack: The rack's model.
+        intrinsics: Recorded or, for an organised cloud, estimated from it; None where there are none.
+        detections: All boxes.
+        rack_pose: The rack's pose, or why there is none.
+        targets: Every detected tube (empty without a rack's pose).
+        times: Duration of the shared stages.
+    """
+
+    frame: RgbdFrame
+    rack: RackModel
+    intrinsics: CameraIntrinsics | None
+    detections: tuple[Detection, ...]
+    rack_pose: RackPose
+    targets: tuple[TubeTarget, ...]
+    times: tuple[StageTime, ...]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TubeEstimate:
+    """One method's answer for one detected tube.
+
+    Attributes:
+        method: Name in `METHODS`.
+        seed: Seed of a stochastic method, else None.
+        target: What the method was asked.
+        pose: Its answer in the rack frame.
+        T_camera_tube: The same in the camera frame, shape (4, 4), metres; None without a pose.
+    """
+
+    method: str
+    seed: int | None
+    target: TubeTarget
+    pose: TubePose
+    T_camera_tube: FloatArray | None
+
+
+@dataclass(slots=True)
+class _Clock:
+    times: list[StageTime] = field(default_factory=list)
+
+    @contextmanager
+    def stage(self, stage: str, method: str = "all", instance: str = "", seed: int | None = None) -> Iterator[None]:
+        start = time.perf_counter_ns()
+        yield
+        self.times.append(StageTime(stage, method, instance, seed, (time.perf_counter_ns() - start) / 1e6))
+
+
+def prepare_scene(
+    frame: RgbdFrame,
+    rack: RackModel,
+    tubes: Sequence[TubeModel],
+    detector: Detector,
+    config: Config,
+    hint: SlotHint | None = None,
+) -> Scene:
+    """Detect, register the rack, and find the slot and the type of every tube.
+
+    Args:
+        frame: The frame.
+        rack: The rack that stands in it.
+        tubes: The kinds of tube that can stand in it.
+        detector: Source of boxes.
+        config: All sections.
+        hint: Which way round the rack stands, if known.
+    """
+    clock = _Clock()
+    intrinsics = frame.intrinsics
+    if intrinsics is None and frame.organised:
+        intrinsics = estimate_intrinsics(frame.cloud_m)
+    with clock.stage("detect"):
+        detections = detector.detect(frame)
+    with clock.stage("rack"):
+        rack_pose = _rack_pose(frame, rack, detections, config, hint, intrinsics)
+    targets: tuple[TubeTarget, ...] = ()
+    if rack_pose.T_camera_rack is not None:
+        with clock.stage("slots"):
+            targets = _targets(frame, rack, tubes, detections, rack_pose.T_camera_rack, config)
+    return Scene(frame, rack, intrinsics, detections, rack_pose, targets, tuple(clock.times))
+
+
+def estimate_tubes(
+    scene: Scene, method: str, config: Config, seed: int | None = None
+) -> tuple[tuple[TubeEstimate, ...], tuple[StageTime, ...]]:
+    """Ask one method for every detected tube of a scene."""
+    clock = _Clock()
+    estimates = []
+    T_camera_rack = scene.rack_pose.T_camera_rack
+    for target in scene.targets:
+        if target.slot is None or target.tube is None:
+            pose = TubePose(TubeStatus.REJECTED, target.reason, n_points=len(target.points_m))
+        else:
+            slot = scene.rack.slot(target.slot)
+            with clock.stage("tube", method, target.slot, seed):
+                points_m = remove_outliers(target.points_m, config.preprocess)
+                pose = METHODS[method](points_m, slot, target.tube, scene.rack, config, seed or 0)
+        found = pose.T_rack_tube is not None and T_camera_rack is not None
+        T_camera_tube = T_camera_rack @ pose.T_rack_tube if found else None
+        estimates.append(TubeEstimate(method, seed, target, pose, T_camera_tube))
+    return tuple(estimates), tuple(clock.times)
+
+
+def _rack_pose(
+    frame: RgbdFrame,
+    rack: RackModel,
+    detections: Sequence[Detection],
+    config: Config,
+    hint: SlotHint | None,
+    intrinsics: CameraIntrinsics | None,
+) -> RackPose:
+    racks = [detection for detection in detections if detection.is_rack]
+    if not racks:
+        return RackPose(RackStatus.NOT_FOUND, "the detector found no rack")
+    best = max(racks, key=lambda detection: detection.score)
+    return register_rack(frame.points_m[rows_in_box(frame, best)], rack, config, hint, intrinsics)
+
+
+def _targets(
+    frame: RgbdFrame,
+    rack: RackModel,
+    tubes: Sequence[TubeModel],
+    detections: Sequence[Detection],
+    T_camera_rack: FloatArray,
+    config: Config,
+) -> tuple[TubeTarget, ...]:
+    T_rack_camera = invert_transform(T_camera_rack)
+    indices = [i for i, detection in enumerate(detections) if not detection.is_rack]
+    clouds = [transform_points(T_rack_camera, frame.points_m[rows_in_box(frame, detections[i])]) for i in indices]
+    assigned = assign_slots(clouds, rack, config.slots)
+    return tuple(
+        _target(index, detections[index].class_name, entry, rack, tubes, config)
+        for index, entry in zip(indices, assigned, strict=True)
+    )
+
+
+def _target(
+    index: int, class_name: str, entry: SlotAssignment, rack: RackModel, tubes: Sequence[TubeModel], config: Config
+) -> TubeTarget:
+    points_m = entry.points_m
+    if entry.slot is None:
+        return TubeTarget(index, None, None, entry.share, entry.reason, points_m)
+    if not tubes:
+        return TubeTarget(index, entry.slot, None, entry.share, "no tube model given (--tubes)", points_m)
+    slot = rack.slot(entry.slot)
+    tube, reason = identify_tube(class_name, points_m, tubes, rack, config.slots)
+    if tube is not None:
+        points_m = crop_to_slot(points_m, slot, tube, rack, config.slots)
+    return TubeTarget(index, entry.slot, tube, entry.share, reason, points_m)
+
+
+__all__ = [
+    "DEFAULT_METHOD",
+    "METHODS",
+    "STOCHASTIC",
+    "Scene",
+    "StageTime",
+    "TubeEstimate",
+    "TubeTarget",
+    "estimate_tubes",
+    "prepare_scene",
+]

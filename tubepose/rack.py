@@ -1,0 +1,285 @@
+"""Pose of the rack: OBB start with every hypothesis, ICP on the template of the top surface (paper, section IV-A).
+
+A scan of a rack's top cannot always tell which way round the rack stands, and ICP's fitness cannot tell a rack from one
+of another pitch: both are measured here, reported, and decide about the status.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import StrEnum
+from functools import lru_cache
+from itertools import permutations, product
+
+import numpy as np
+import open3d as o3d
+from scipy.spatial import cKDTree
+
+from tubepose.capture.frame import CameraIntrinsics
+from tubepose.capture.session import SlotHint
+from tubepose.config import Config, RackConfig
+from tubepose.labware import RackModel
+from tubepose.preprocessing import (
+    RackTop,
+    find_rack_top,
+    point_spacing_m,
+    remove_outliers,
+    suspect_unit_factor,
+    to_o3d,
+    voxel_downsample,
+)
+from tubepose.transforms import FloatArray, invert_transform, make_transform, transform_points
+
+HALF_TURN = np.diag([-1.0, -1.0, 1.0, 1.0])
+
+
+class RackStatus(StrEnum):
+    """What became of a rack."""
+
+    OK = "ok"
+    NOT_FOUND = "not_found"
+    INSUFFICIENT = "insufficient"
+    REFUSED = "refused"
+    UNIT = "wrong_unit"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RackPose:
+    """Pose of a rack in the camera frame.
+
+    Attributes:
+        status: OK, or the kind of failure.
+        reason: In words, empty when OK.
+        T_camera_rack: Array of shape (4, 4); maps rack points to camera points, metres. None unless status is OK.
+        inlier_rmse_m: RMS distance of the ICP inliers, metres; NaN without a registration.
+        fitness: Share of the top's points with a correspondence; NaN without a registration.
+        in_slot_share: Share of the top's points that lie inside the template's openings; NaN without a registration.
+        coverage: Share of the template that the scan covers; NaN without a registration.
+        ambiguous: True when neither geometry nor a hint tells the rack from itself turned by 180 degrees.
+        resolved_by: ``geometry``, ``hint``, or ``rule`` (rack x points to the bottom right of the image); empty without a pose.
+        turn_margin_m: Inlier rmse of the other turn minus that of this one, metres; NaN without a registration.
+        spacing_m: Median point spacing of the top, metres; NaN without points.
+    """
+
+    status: RackStatus
+    reason: str = ""
+    T_camera_rack: FloatArray | None = None
+    inlier_rmse_m: float = float("nan")
+    fitness: float = float("nan")
+    in_slot_share: float = float("nan")
+    coverage: float = float("nan")
+    ambiguous: bool = False
+    resolved_by: str = ""
+    turn_margin_m: float = float("nan")
+    spacing_m: float = float("nan")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Registration:
+    T_camera_rack: FloatArray
+    fitness: float
+    inlier_rmse_m: float
+
+
+@lru_cache(maxsize=16)
+def rack_template_m(rack: RackModel, spacing_m: float) -> FloatArray:
+    """Template of the top surface: a grid on the solid part of the top, rack frame, shape (N, 3), metres."""
+    half = rack.outline_m / 2
+    axes = [np.arange(-h + spacing_m / 2, h, spacing_m) for h in half]
+    xy = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 2)
+    xy = xy[rack.top_signed_distance_m(xy) <= 0]
+    return np.column_stack([xy, np.full(len(xy), rack.height_m)])
+
+
+def register_rack(
+    points_m: FloatArray,
+    rack: RackModel,
+    config: Config,
+    hint: SlotHint | None = None,
+    intrinsics: CameraIntrinsics | None = None,
+) -> RackPose:
+    """Estimate a rack's pose from the points that a detector gave it.
+
+    Args:
+        points_m: Array of shape (N, 3), camera frame, metres, without NaN: the rack's box, with whatever stands in it.
+        rack: The rack's definition.
+        config: Sections preprocess, rack_top and rack are used.
+        hint: Where a slot is seen in the image, to tell the two turns apart.
+        intrinsics: Of that image; without them the hint is not used.
+    """
+    if len(points_m) < 50:
+        return RackPose(RackStatus.INSUFFICIENT, f"{len(points_m)} valid points on the rack, expected at least 50")
+    top = find_rack_top(points_m, rack, config.rack_top)
+    spacing_m = point_spacing_m(points_m)
+    if top is None or not top.fits(config.rack_top):
+        return _not_found(points_m, top, spacing_m, rack, config)
+    band = points_m[top.band_rows]
+    scan = remove_outliers(voxel_downsample(band, config.preprocess.rack_voxel_m), config.preprocess)
+    if len(scan) < 50:
+        return RackPose(RackStatus.INSUFFICIENT, f"{len(scan)} points on the rack's top", spacing_m=spacing_m)
+    best, turned = _register_all(scan, top, rack, config.rack)
+    margin_m = turned.inlier_rmse_m - best.inlier_rmse_m
+    chosen, other, resolved_by = _choose_turn(best, turned, rack, config.rack, hint, intrinsics)
+    in_slot, coverage = _agreement(scan, chosen.T_camera_rack, rack, config.rack)
+    reason = _refusal(chosen, in_slot, coverage, rack, config.rack)
+    spacing_m = point_spacing_m(band)
+    status = RackStatus.REFUSED if reason else RackStatus.OK
+    coarse = _too_coarse(spacing_m, rack, config.rack)
+    if coarse:
+        status, reason = RackStatus.INSUFFICIENT, coarse
+    return RackPose(
+        status,
+        reason,
+        chosen.T_camera_rack if status is RackStatus.OK else None,
+        chosen.inlier_rmse_m,
+        chosen.fitness,
+        in_slot,
+        coverage,
+        ambiguous=resolved_by == "rule" and status is RackStatus.OK,
+        resolved_by=resolved_by if status is RackStatus.OK else "",
+        turn_margin_m=margin_m if chosen is best else -margin_m,
+        spacing_m=spacing_m,
+    )
+
+
+def _not_found(
+    points_m: FloatArray, top: RackTop | None, spacing_m: float, rack: RackModel, config: Config
+) -> RackPose:
+    expected = " x ".join(f"{side * 1e3:.1f}" for side in sorted(rack.outline_m, reverse=True))
+    factor = suspect_unit_factor(points_m, rack, config.rack_top)
+    if factor is not None:
+        size = "larger" if factor > 1 else "smaller"
+        times = factor if factor > 1 else 1 / factor
+        return RackPose(
+            RackStatus.UNIT,
+            f"a rack of this shape is there, but {times:g} times {size} than {rack.name} ({expected} mm): "
+            "is the unit of the capture declared right (m or mm)?",
+            spacing_m=spacing_m,
+        )
+    coarse = _too_coarse(spacing_m, rack, config.rack)
+    if coarse:
+        return RackPose(RackStatus.INSUFFICIENT, coarse, spacing_m=spacing_m)
+    found = "no level band" if top is None else f"a band of {top.size_m[0] * 1e3:.1f} x {top.size_m[1] * 1e3:.1f} mm"
+    return RackPose(
+        RackStatus.NOT_FOUND,
+        f"no top of {rack.name} ({expected} mm) among the points; closest: {found}",
+        spacing_m=spacing_m,
+    )
+
+
+def _too_coarse(spacing_m: float, rack: RackModel, config: RackConfig) -> str:
+    limit_m = config.max_spacing_ratio * rack.min_rib_m
+    if spacing_m <= limit_m:
+        return ""
+    return (
+        f"insufficient data: points are {spacing_m * 1e3:.2f} mm apart, and the ribs of {rack.name} are "
+        f"{rack.min_rib_m * 1e3:.2f} mm wide; a finer or nearer scan is needed"
+    )
+
+
+def _hypotheses(top: RackTop, band_m: FloatArray, rack: RackModel) -> list[FloatArray]:
+    """Every right-handed assignment of the OBB's axes to the rack's with z up, as T_camera_rack."""
+    box = to_o3d(band_m).get_minimal_oriented_bounding_box()
+    up = top.T_camera_top[:3, 2]
+    found = []
+    for order in permutations(range(3)):
+        for signs in product((1.0, -1.0), repeat=3):
+            R = box.R[:, order] * np.array(signs)
+            if np.linalg.det(R) > 0 and R[:, 2] @ up > np.cos(np.deg2rad(30)):
+                found.append(make_transform(R, box.center - rack.height_m * R[:, 2]))
+    return found
+
+
+def _register_all(
+    scan_m: FloatArray, top: RackTop, rack: RackModel, config: RackConfig
+) -> tuple[_Registration, _Registration]:
+    """Best registration over all hypotheses, and the same turned by 180 degrees and refined."""
+    template_m = rack_template_m(rack, config.template_spacing_m)
+    target = to_o3d(template_m)
+    source = to_o3d(scan_m)
+    corners = np.array([[x, y, 0.0] for x in (-0.5, 0.5) for y in (-0.5, 0.5)]) * [*top.size_m, 0.0]
+    outline_m = np.vstack([scan_m, transform_points(top.T_camera_top, corners)])
+    starts = _hypotheses(top, outline_m, rack)
+    coarse = [_icp(source, target, start, config, config.icp_distances_m[:1]) for start in starts]
+    best = max(coarse, key=lambda r: (round(r.fitness, 3), -r.inlier_rmse_m))
+    fine = config.icp_distances_m[1:]
+    turned_start = best.T_camera_rack @ HALF_TURN
+    return _icp(source, target, best.T_camera_rack, config, fine), _icp(source, target, turned_start, config, fine)
+
+
+def _icp(
+    source: o3d.geometry.PointCloud,
+    target: o3d.geometry.PointCloud,
+    start: FloatArray,
+    config: RackConfig,
+    distances_m: tuple[float, ...],
+) -> _Registration:
+    """Point-to-point ICP of the scan onto the template: each scan point has a partner, each template point need not."""
+    criteria = o3d.pipelines.registration.ICPConvergenceCriteria(max_iteration=config.icp_iterations)
+    method = o3d.pipelines.registration.TransformationEstimationPointToPoint()
+    T_rack_camera = invert_transform(start)
+    for distance_m in distances_m:
+        result = o3d.pipelines.registration.registration_icp(
+            source, target, distance_m, T_rack_camera, method, criteria
+        )
+        # Without any correspondence Open3D reports rmse 0.0 and no error.
+        if result.fitness == 0.0:
+            return _Registration(start, 0.0, float("inf"))
+        T_rack_camera = result.transformation
+    judged = o3d.pipelines.registration.evaluate_registration(source, target, config.judge_distance_m, T_rack_camera)
+    return _Registration(invert_transform(T_rack_camera), float(judged.fitness), float(judged.inlier_rmse))
+
+
+def _choose_turn(
+    best: _Registration,
+    turned: _Registration,
+    rack: RackModel,
+    config: RackConfig,
+    hint: SlotHint | None,
+    intrinsics: CameraIntrinsics | None,
+) -> tuple[_Registration, _Registration, str]:
+    """The turn to report, the other one, and what decided."""
+    if turned.inlier_rmse_m - best.inlier_rmse_m > config.ambiguous_margin_m:
+        return best, turned, "geometry"
+    pair = (best, turned)
+    if hint is not None and intrinsics is not None:
+        point = np.array([*rack.slot(hint.slot).center_m, rack.height_m])
+        pixels = [intrinsics.project(transform_points(r.T_camera_rack, point)) for r in pair]
+        distances = [float(np.hypot(*(pixel - np.array(hint.pixel)))) for pixel in pixels]
+        if abs(distances[0] - distances[1]) > 0.25 * float(np.hypot(*(pixels[0] - pixels[1]))) > 0:
+            return (*(pair if distances[0] < distances[1] else pair[::-1]), "hint")
+    # Decided by the image's diagonal: racks stand along the image's sides more often than along its diagonal.
+    return (*(pair if best.T_camera_rack[:2, 0].sum() > 0 else pair[::-1]), "rule")
+
+
+def _agreement(
+    scan_m: FloatArray, T_camera_rack: FloatArray, rack: RackModel, config: RackConfig
+) -> tuple[float, float]:
+    """Share of the scan inside the openings, and share of the template that the scan covers."""
+    in_rack = transform_points(invert_transform(T_camera_rack), scan_m)
+    inside_outline = np.all(np.abs(in_rack[:, :2]) <= rack.outline_m / 2, axis=1)
+    in_slot = inside_outline & (rack.top_signed_distance_m(in_rack[:, :2]) > config.slot_margin_m)
+    template_m = rack_template_m(rack, config.template_spacing_m)[::7]
+    distances, _ = cKDTree(in_rack).query(template_m, distance_upper_bound=2.5e-3)
+    return float(in_slot.mean()), float(np.isfinite(distances).mean())
+
+
+def _refusal(found: _Registration, in_slot: float, coverage: float, rack: RackModel, config: RackConfig) -> str:
+    """Why a registration is no rack, in words; empty if it is one."""
+    checks = (
+        (found.fitness < config.min_fitness, f"fitness {found.fitness:.3f}, at least {config.min_fitness} expected"),
+        (
+            found.inlier_rmse_m > config.max_inlier_rmse_m,
+            f"inlier rmse {found.inlier_rmse_m * 1e3:.2f} mm, at most {config.max_inlier_rmse_m * 1e3:.2f} mm expected",
+        ),
+        (
+            in_slot > config.max_in_slot_share,
+            f"{in_slot:.1%} of the top's points lie inside the openings of {rack.name}, "
+            f"at most {config.max_in_slot_share:.1%} expected: another rack?",
+        ),
+        (
+            coverage < config.min_coverage,
+            f"{coverage:.1%} of the top seen, at least {config.min_coverage:.0%} expected",
+        ),
+    )
+    return "; ".join(text for failed, text in checks if failed)

@@ -1,0 +1,155 @@
+"""Which slot holds which tube, and which slots are empty (paper, section IV-B, first part)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+
+import cv2
+import numpy as np
+from scipy.spatial import ConvexHull, QhullError
+
+from tubepose.config import SlotConfig
+from tubepose.labware import RackModel, SlotModel, TubeModel
+from tubepose.transforms import FloatArray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SlotAssignment:
+    """What one detected tube's points say about its slot.
+
+    Attributes:
+        detection: Index of the detection.
+        slot: Name of the slot, or None if the tube stands on none.
+        share: Share of the projected hull's area that lies in that slot's opening.
+        reason: Why there is no slot; empty otherwise.
+        points_m: The tube's points, rack frame, shape (N, 3), metres: above the top, and not beyond its own slot's reach.
+    """
+
+    detection: int
+    slot: str | None
+    share: float
+    reason: str
+    points_m: FloatArray
+
+
+def points_above(points_m: FloatArray, rack: RackModel, config: SlotConfig) -> FloatArray:
+    """Points (N, 3) in the rack frame that stand above the rack's top, metres."""
+    return points_m[points_m[:, 2] > rack.height_m + config.clearance_m]
+
+
+def slot_shares(points_m: FloatArray, rack: RackModel) -> FloatArray:
+    """Share of the area of the points' convex hull, projected onto the top, in every slot's opening; shape (S,).
+
+    All zeros where the points span no area.
+    """
+    shares = np.zeros(len(rack.all_slots))
+    try:
+        hull = points_m[ConvexHull(points_m[:, :2]).vertices, :2] if len(points_m) >= 3 else np.empty((0, 2))
+    except QhullError:
+        return shares
+    if len(hull) < 3:
+        return shares
+    outline = (hull * 1e3).astype(np.float32)
+    area = cv2.contourArea(outline)
+    low, high = outline.min(axis=0), outline.max(axis=0)
+    for i, opening in enumerate(_openings_mm(rack)):
+        if area > 0 and np.all(opening.max(axis=0) > low) and np.all(opening.min(axis=0) < high):
+            shares[i] = cv2.intersectConvexConvex(outline, opening)[0] / area
+    return shares
+
+
+@lru_cache(maxsize=16)
+def _openings_mm(rack: RackModel) -> list[np.ndarray]:
+    return [(slot.boundary_m() * 1e3).astype(np.float32) for slot in rack.all_slots]
+
+
+def assign_slots(tubes_m: Sequence[FloatArray], rack: RackModel, config: SlotConfig) -> tuple[SlotAssignment, ...]:
+    """Give every tube the slot with the largest share of its projected hull.
+
+    Two tubes on one slot: the one with the larger share keeps it, the other takes its next best free slot if its share
+    there is large enough, or ends without a slot.
+
+    Args:
+        tubes_m: Per detected tube its points, rack frame, shape (N, 3), metres.
+        rack: The rack.
+        config: Thresholds.
+    """
+    above = [points_above(points, rack, config) for points in tubes_m]
+    shares = np.array([slot_shares(points, rack) for points in above]).reshape(len(above), len(rack.all_slots))
+    names = [slot.name for slot in rack.all_slots]
+    taken: dict[int, int] = {}
+    reasons = ["no points above the rack's top" if len(points) == 0 else "" for points in above]
+    candidates = [
+        (tube, int(slot)) for tube in range(len(above)) for slot in np.flatnonzero(shares[tube] >= config.min_share)
+    ]
+    for tube, slot in sorted(candidates, key=lambda pair: (-shares[pair], pair)):
+        if tube in taken:
+            continue
+        if slot in taken.values():
+            reasons[tube] = f"slot {names[slot]} holds another tube"
+            continue
+        taken[tube] = slot
+    found = []
+    for tube, points in enumerate(above):
+        chosen = taken.get(tube)
+        if chosen is None:
+            reason = (
+                reasons[tube]
+                or f"at most {shares[tube].max(initial=0.0):.0%} of it is above one slot: lies across the rack?"
+            )
+            found.append(SlotAssignment(tube, None, float(shares[tube].max(initial=0.0)), reason, points))
+        else:
+            found.append(SlotAssignment(tube, names[chosen], float(shares[tube, chosen]), "", points))
+    return tuple(found)
+
+
+def lean_reach_m(z_m: FloatArray, slot: SlotModel, tube: TubeModel, rack: RackModel) -> FloatArray:
+    """How far the tube's axis can be from the slot's axis at heights z above the base, metres: play plus lean."""
+    play = rack.floor_play_mm * 1e-3
+    clearance = np.hypot(*np.maximum(slot.half_size_m - tube.body_radius_m(rack.depth_m), 0.0))
+    return np.asarray(play + (clearance + play) * (np.asarray(z_m) - rack.floor_m) / rack.depth_m)
+
+
+def crop_to_slot(
+    points_m: FloatArray, slot: SlotModel, tube: TubeModel, rack: RackModel, config: SlotConfig
+) -> FloatArray:
+    """Points (N, 3), rack frame, that a tube in this slot can own: the rest of its box is another tube's (section III)."""
+    lateral = np.hypot(*(points_m[:, :2] - slot.center_m).T)
+    limit = tube.max_radius_m + lean_reach_m(points_m[:, 2], slot, tube, rack) + config.reach_m
+    below_top = points_m[:, 2] < rack.floor_m + tube.height_m + 2 * config.reach_m
+    return points_m[(lateral < limit) & below_top]
+
+
+def identify_tube(
+    class_name: str, points_m: FloatArray, candidates: Sequence[TubeModel], rack: RackModel, config: SlotConfig
+) -> tuple[TubeModel | None, str]:
+    """The tube model of a detection, by its class where the detector gives one, else by the height of its points.
+
+    Args:
+        class_name: The detector's word; a tube model answers to its name and to its `classes`.
+        points_m: The tube's points, rack frame, shape (N, 3), metres.
+        candidates: The tubes that can be in this rack.
+        rack: For the floor that the tube stands on.
+        config: Tolerance of the height.
+
+    Returns:
+        The model and an empty reason, or None and the reason.
+    """
+    named = [tube for tube in candidates if class_name == tube.name or class_name in tube.classes]
+    if named:
+        return named[0], ""
+    if class_name != "tube":
+        known = sorted({word for tube in candidates for word in (tube.name, *tube.classes)})
+        return None, f"class '{class_name}' belongs to none of the tubes given (they answer to {', '.join(known)})"
+    height_m = float(np.percentile(points_m[:, 2], 95)) - rack.floor_m
+    differences = [abs(tube.height_m - height_m) for tube in candidates]
+    order = np.argsort(differences)
+    if differences[order[0]] > config.height_tolerance_m:
+        heights = ", ".join(f"{tube.name} {tube.height_mm:g}" for tube in candidates)
+        return None, f"unknown type: {height_m * 1e3:.1f} mm high, expected (mm): {heights}"
+    if len(candidates) > 1 and differences[order[1]] - differences[order[0]] < 0.4 * config.height_tolerance_m:
+        alike = f"{candidates[order[0]].name} and {candidates[order[1]].name}"
+        return None, f"{height_m * 1e3:.1f} mm high: {alike} are not told apart by height"
+    return candidates[order[0]], ""
