@@ -56,7 +56,7 @@ def fit_global_icp(
     scan.estimate_normals(o3d.geometry.KDTreeSearchParamHybrid(config.icp.normal_radius_m, 30))
     scan.orient_normals_towards_camera_location(np.array([0.0, 0.0, 1.0]))
     radius = o3d.geometry.KDTreeSearchParamHybrid(config.icp.feature_radius_m, 100)
-    features = registration.compute_fpfh_feature(scan, radius)
+    features = registration.compute_fpfh_feature(scan, radius)  # type: ignore[call-arg]  # stub lacks a default
     o3d.utility.random.seed(seed)
     found = registration.registration_ransac_based_on_feature_matching(
         scan,
@@ -127,7 +127,7 @@ def _template(tube: TubeModel, hidden_m: float, count: int) -> o3d.geometry.Poin
     z = segments[k, 0] + t * (segments[k, 2] - segments[k, 0])
     r = segments[k, 1] + t * (segments[k, 3] - segments[k, 1])
     turn = np.arange(count) * np.pi * (3 - np.sqrt(5))
-    # The profile runs with the outside on its right: (dz, dr) turned gives the outward normal (-dr along z, dz along r).
+    # The profile runs with the outside on its right: (dz, dr) turned gives the outward normal (-dr, dz).
     n_z = -(segments[k, 3] - segments[k, 1]) / length[k]
     n_r = (segments[k, 2] - segments[k, 0]) / length[k]
     cloud = to_o3d(np.column_stack([r * np.cos(turn), r * np.sin(turn), z]))
@@ -152,4 +152,4 @@ def _features(
     target = template.voxel_down_sample(config.voxel_m)
     target.normalize_normals()
     radius = o3d.geometry.KDTreeSearchParamHybrid(config.feature_radius_m, 100)
-    return target, registration.compute_fpfh_feature(target, radius)
+    return target, registration.compute_fpfh_feature(target, radius)  # type: ignore[call-arg]  # as above

@@ -1,7 +1,7 @@
 """Every tunable number of the estimators: one frozen section per stage, defaults beside the reason for them.
 
 A user's YAML file (``--config``) may set any of them; an unknown key fails and names the known ones.
-None of the defaults was fitted to a capture that a table of ours is computed on; docs/method.md says where each is from.
+No default was fitted to a capture that a table of ours is computed on; docs/method.md says where each is from.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ class RackTopConfig(_Section):
         bin_m: Bin of the height histogram.
         band_m: Half thickness of the band about a histogram peak.
         outline_tolerance_m: Allowed difference of the measured and the defined outline, per side.
-        max_in_slot_share: Largest share of the band in the rack's openings; the slots' floor has nearly all of it there.
+        max_in_slot_share: Largest share of the band in the openings; the slots' floor has nearly all of it there.
         search_points: Points of the cloud that the search sees, evenly thinned.
         seed: Seed of the RANSAC.
     """
@@ -72,6 +72,7 @@ class RackConfig(_Section):
         template_spacing_m: Grid of the template of the top surface.
         icp_distances_m: Correspondence distance of each ICP round, coarse to fine.
         icp_iterations: Iterations per round.
+        coarse_points: Points of the scan that the first round of every hypothesis sees.
         judge_distance_m: Correspondence distance at which fitness and rmse of the result are stated and judged.
         max_inlier_rmse_m: A larger inlier rmse is no rack (a real scan of the right rack reaches 1.0 mm).
         min_fitness: Smallest share of the scan's top points with a correspondence.
@@ -79,12 +80,13 @@ class RackConfig(_Section):
         max_in_slot_share: Largest share of such points: fitness alone accepts a rack of another pitch.
         min_coverage: Smallest share of the template that is seen.
         ambiguous_margin_m: Two turns whose rmse differ by less are not told apart by geometry.
-        max_spacing_ratio: Largest point spacing, in units of the rack's narrowest rib: coarser captures are insufficient.
+        max_spacing_ratio: Largest point spacing, in units of the rack's narrowest rib; coarser is insufficient.
     """
 
     template_spacing_m: float = 5.0e-4
     icp_distances_m: tuple[float, ...] = (6.0e-3, 3.0e-3, 1.2e-3)
     icp_iterations: int = 60
+    coarse_points: int = 2000
     judge_distance_m: float = 3.0e-3
     max_inlier_rmse_m: float = 1.1e-3
     min_fitness: float = 0.9
@@ -103,7 +105,7 @@ class SlotConfig(_Section):
         clearance_m: Points must stand this far above the rack's top to be a tube's.
         reach_m: How far beyond a tube's largest radius its points may lie from its slot's axis at the top: the lean.
         min_share: Smallest share of the projected hull's area for a slot to hold the tube.
-        height_tolerance_m: Largest difference between a tube's measured and defined height when types are told by height.
+        height_tolerance_m: Largest difference between the measured and the defined height of a tube type.
     """
 
     top_band_m: float = 2.5e-3
@@ -120,7 +122,7 @@ class TubeConfig(_Section):
         objective: Cost of Eq. 3: ``hinge`` sum max(D - r, 0); ``signed`` sum (D - r), as printed; ``l1``; ``l2``;
             ``count`` of D > r, as in the authors' own program.
         max_tilt_rad: Bound of alpha and beta in the search.
-        tolerance_m: Added to the clearance of Eq. 5, beside the rack's own floor play, for the fit's error at the rack's top.
+        tolerance_m: Added to the clearance of Eq. 5, beside the rack's floor play, for the fit's error at the top.
         min_points: Fewer points reject the tube.
     """
 

@@ -7,7 +7,6 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 
-
 from tubepose.baselines import fit_global_icp, fit_slot_icp, fit_upright
 from tubepose.capture.frame import CameraIntrinsics, RgbdFrame
 from tubepose.capture.registration import estimate_intrinsics
@@ -172,8 +171,9 @@ def estimate_tubes(
             with clock.stage("tube", method, target.slot, seed):
                 points_m = remove_outliers(target.points_m, config.preprocess)
                 pose = METHODS[method](points_m, slot, target.tube, scene.rack, config, seed or 0)
-        found = pose.T_rack_tube is not None and T_camera_rack is not None
-        T_camera_tube = T_camera_rack @ pose.T_rack_tube if found else None
+        T_camera_tube = None
+        if pose.T_rack_tube is not None and T_camera_rack is not None:
+            T_camera_tube = T_camera_rack @ pose.T_rack_tube
         estimates.append(TubeEstimate(method, seed, target, pose, T_camera_tube))
     return tuple(estimates), tuple(clock.times)
 

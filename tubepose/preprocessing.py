@@ -1,4 +1,4 @@
-"""Points before any pose: outlier removal, down-sampling, and the height band of the rack's top (paper, section III)."""
+"""Points before any pose: outlier removal, down-sampling, the height band of the rack's top (paper, section III)."""
 
 from __future__ import annotations
 
@@ -17,6 +17,8 @@ from tubepose.transforms import FloatArray, invert_transform, make_transform, tr
 
 Rows = NDArray[np.intp]
 TALLEST_TUBE_M = 0.15
+OUTLINE_OF_INTEREST_M = 0.02
+PATCH_RADIUS_M = 0.03
 UNIT_FACTORS = (10.0, 0.1, 1000.0, 0.001)
 
 
@@ -26,7 +28,7 @@ def to_o3d(points_m: FloatArray) -> o3d.geometry.PointCloud:
 
 
 def remove_outliers(points_m: FloatArray, config: PreprocessConfig) -> FloatArray:
-    """Statistical outlier removal of points of shape (N, 3), metres; clouds below the neighbour count are returned as they are."""
+    """Statistical outlier removal of points of shape (N, 3), metres; very small clouds are returned as they are."""
     if len(points_m) <= config.outlier_neighbors:
         return points_m
     cloud, _ = to_o3d(points_m).remove_statistical_outlier(config.outlier_neighbors, config.outlier_std_ratio)
@@ -50,7 +52,7 @@ def point_spacing_m(points_m: FloatArray, sample: int = 500) -> float:
     if len(points_m) < 2:
         return float("nan")
     distances, _ = cKDTree(points_m).query(thin(points_m, sample), k=2)
-    return float(np.median(distances[:, 1]))
+    return float(np.median(np.asarray(distances)[:, 1]))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -127,16 +129,32 @@ def _measure_again(points_m: FloatArray, coarse: RackTop, rack: RackModel, confi
     return found if found is not None else coarse
 
 
-def suspect_unit_factor(points_m: FloatArray, rack: RackModel, config: RackTopConfig) -> float | None:
-    """The factor by which the cloud is too large (10, 1000) or too small (0.1, 0.001) for its rack, or None.
+def level_noise_m(points_m: FloatArray, config: RackTopConfig) -> float:
+    """How far depth scatters on what should be flat, metres: median rms of patches about their own planes.
 
-    Only asked when no rack was found as it is.
+    The patches lie on the first level plane. Smooth waves, as stereo cameras make them, count: a patch is wide enough
+    to hold a slot and its ribs. NaN where no patch has enough points.
     """
-    for factor in UNIT_FACTORS:
-        top = find_rack_top(points_m / factor, rack, config)
-        if top is not None and top.fits(config):
-            return factor
-    return None
+    sample = thin(points_m, config.search_points)
+    plane = next(_level_planes(sample, config), None)
+    if plane is None:
+        return float("nan")
+    normal, origin = plane
+    level = sample[np.abs((sample - origin) @ normal) < 3 * PATCH_RADIUS_M / 4]
+    patches: list[list[int]] = list(cKDTree(level).query_ball_point(thin(level, 100), PATCH_RADIUS_M))
+    rms = [_plane_rms(level[list(patch)]) for patch in patches if len(patch) >= 30]
+    return float(np.median(rms)) if rms else float("nan")
+
+
+def _plane_rms(points_m: FloatArray) -> float:
+    return float(np.sqrt(max(np.linalg.eigvalsh(np.cov(points_m.T))[0], 0.0)))
+
+
+def plausible_unit_factors(points_m: FloatArray, rack: RackModel) -> tuple[float, ...]:
+    """Factors by which a cloud could be too large (10, 1000) or too small (0.1, 0.001): a rack fits in, and no hall."""
+    extent_m = float(np.ptp(np.percentile(points_m, [1, 99], axis=0), axis=0).max())
+    smallest, largest = 0.8 * float(rack.outline_m.min()), 6.0
+    return tuple(factor for factor in UNIT_FACTORS if smallest < extent_m / factor < largest)
 
 
 def _level_planes(points_m: FloatArray, config: RackTopConfig) -> Iterator[tuple[FloatArray, FloatArray]]:
@@ -146,7 +164,7 @@ def _level_planes(points_m: FloatArray, config: RackTopConfig) -> Iterator[tuple
         if len(rest) < 100:
             return
         o3d.utility.random.seed(config.seed)
-        plane, inliers = to_o3d(rest).segment_plane(config.plane_distance_m, 3, config.plane_iterations)
+        _, inliers = to_o3d(rest).segment_plane(config.plane_distance_m, 3, config.plane_iterations)
         support = rest[inliers]
         if len(support) < 50:
             return
@@ -211,23 +229,28 @@ def _outline(points_m: FloatArray, rows: Rows, band: Rows, normal: FloatArray, r
 
 
 def _rectangle(
-    points_m: FloatArray, band: Rows, T_level_camera: FloatArray, center_m: FloatArray, turn_rad: float, size_m: FloatArray,
+    points_m: FloatArray,
+    band: Rows,
+    T_level_camera: FloatArray,
+    center_m: FloatArray,
+    turn_rad: float,
+    size_m: FloatArray,
     rack: RackModel,
-) -> RackTop:  # fmt: skip
+) -> RackTop:
     """The band in one of the two frames along a rectangle's sides."""
     cos, sin = np.cos(turn_rad), np.sin(turn_rad)
     T_level_top = make_transform(np.array([[cos, -sin, 0], [sin, cos, 0], [0, 0, 1]]), np.array([*center_m, 0.0]))
     T_top_camera = invert_transform(T_level_top) @ T_level_camera
     local = transform_points(T_top_camera, points_m[band])[:, :2]
     inside = np.all(np.abs(local) <= size_m / 2 + 1e-3, axis=1)
-    # Half a turn matters only for racks whose slots are not the same after it.
-    sample = thin(local[inside], 5000)
-    shares = [
-        float(np.mean(rack.top_signed_distance_m(sign * sample) > 1e-3)) if len(sample) else 1.0 for sign in (1, -1)
-    ]
+    error_m = float(np.max(np.abs(size_m - rack.outline_m)))
+    shares = [1.0, 1.0]
+    if error_m < OUTLINE_OF_INTEREST_M and inside.any():
+        # Half a turn matters only for racks whose slots are not the same after it.
+        sample = thin(local[inside], 2000)
+        shares = [float(np.mean(rack.top_signed_distance_m(k * sample) > 1e-3)) for k in (1, -1)]
     if shares[1] < shares[0]:
         T_top_camera = np.diag([-1.0, -1.0, 1.0, 1.0]) @ T_top_camera
-    error_m = float(np.max(np.abs(size_m - rack.outline_m)))
     size = (float(size_m[0]), float(size_m[1]))
     return RackTop(invert_transform(T_top_camera), size, error_m, min(shares), band[inside])
 
@@ -241,7 +264,7 @@ def _level_frame(up: FloatArray, origin: FloatArray) -> FloatArray:
 
 
 def _largest_patch(flat_m: FloatArray, gap_m: float, area_m2: float) -> Rows | None:
-    """Rows of the points (N, 2) that hang together when openings up to `gap_m` are bridged; None if the area is absurd."""
+    """Rows of the points (N, 2) that hang together when openings up to `gap_m` are bridged; None for an absurd area."""
     cell = 2e-3
     low = flat_m.min(axis=0)
     cells = np.floor((flat_m - low) / cell).astype(np.intp)
@@ -250,8 +273,7 @@ def _largest_patch(flat_m: FloatArray, gap_m: float, area_m2: float) -> Rows | N
         return None
     reach = int(np.ceil(gap_m / 2 / cell)) + 1
     raster = np.zeros(shape + 2 * reach, np.uint8)
-    np.add.at(raster, (cells[:, 0] + reach, cells[:, 1] + reach), 1)
-    raster = np.where(raster > 0, 255, 0).astype(np.uint8)
+    raster[cells[:, 0] + reach, cells[:, 1] + reach] = 255
     kernel = cv2.getStructuringElement(cv2.MORPH_RECT, (2 * reach + 1, 2 * reach + 1))
     closed = cv2.morphologyEx(raster, cv2.MORPH_CLOSE, kernel)
     # A loose pixel outside the outline would widen the rectangle: open by one cell.

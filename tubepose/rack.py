@@ -6,7 +6,7 @@ of another pitch: both are measured here, reported, and decide about the status.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import StrEnum
 from functools import lru_cache
 from itertools import permutations, product
@@ -22,9 +22,11 @@ from tubepose.labware import RackModel
 from tubepose.preprocessing import (
     RackTop,
     find_rack_top,
+    level_noise_m,
+    plausible_unit_factors,
     point_spacing_m,
     remove_outliers,
-    suspect_unit_factor,
+    thin,
     to_o3d,
     voxel_downsample,
 )
@@ -56,7 +58,8 @@ class RackPose:
         in_slot_share: Share of the top's points that lie inside the template's openings; NaN without a registration.
         coverage: Share of the template that the scan covers; NaN without a registration.
         ambiguous: True when neither geometry nor a hint tells the rack from itself turned by 180 degrees.
-        resolved_by: ``geometry``, ``hint``, or ``rule`` (rack x points to the bottom right of the image); empty without a pose.
+        resolved_by: ``geometry``, ``hint``, or ``rule`` (rack x points to the bottom right of the image); empty
+            without a pose.
         turn_margin_m: Inlier rmse of the other turn minus that of this one, metres; NaN without a registration.
         spacing_m: Median point spacing of the top, metres; NaN without points.
     """
@@ -107,63 +110,84 @@ def register_rack(
         hint: Where a slot is seen in the image, to tell the two turns apart.
         intrinsics: Of that image; without them the hint is not used.
     """
+    pose = _register(points_m, rack, config, hint, intrinsics)
+    if pose.status in (RackStatus.NOT_FOUND, RackStatus.REFUSED):
+        reason = _unit_suspicion(points_m, rack, config)
+        if reason:
+            return replace(pose, status=RackStatus.UNIT, reason=reason)
+        noise_m = level_noise_m(points_m, config.rack_top)
+        if noise_m > config.rack.max_inlier_rmse_m:
+            return replace(pose, status=RackStatus.INSUFFICIENT, reason=_too_noisy(noise_m, pose.reason, config.rack))
+    return pose
+
+
+def _register(
+    points_m: FloatArray, rack: RackModel, config: Config, hint: SlotHint | None, intrinsics: CameraIntrinsics | None
+) -> RackPose:
     if len(points_m) < 50:
         return RackPose(RackStatus.INSUFFICIENT, f"{len(points_m)} valid points on the rack, expected at least 50")
     top = find_rack_top(points_m, rack, config.rack_top)
-    spacing_m = point_spacing_m(points_m)
     if top is None or not top.fits(config.rack_top):
-        return _not_found(points_m, top, spacing_m, rack, config)
+        return _not_found(points_m, top, rack, config.rack)
     band = points_m[top.band_rows]
-    scan = remove_outliers(voxel_downsample(band, config.preprocess.rack_voxel_m), config.preprocess)
-    if len(scan) < 50:
-        return RackPose(RackStatus.INSUFFICIENT, f"{len(scan)} points on the rack's top", spacing_m=spacing_m)
-    best, turned = _register_all(scan, top, rack, config.rack)
-    margin_m = turned.inlier_rmse_m - best.inlier_rmse_m
-    chosen, other, resolved_by = _choose_turn(best, turned, rack, config.rack, hint, intrinsics)
-    in_slot, coverage = _agreement(scan, chosen.T_camera_rack, rack, config.rack)
-    reason = _refusal(chosen, in_slot, coverage, rack, config.rack)
     spacing_m = point_spacing_m(band)
-    status = RackStatus.REFUSED if reason else RackStatus.OK
+    scan = remove_outliers(voxel_downsample(band, config.preprocess.rack_voxel_m), config.preprocess)
     coarse = _too_coarse(spacing_m, rack, config.rack)
     if coarse:
-        status, reason = RackStatus.INSUFFICIENT, coarse
+        return RackPose(RackStatus.INSUFFICIENT, coarse, spacing_m=spacing_m)
+    best, turned = _register_all(scan, top, rack, config.rack)
+    margin_m = turned.inlier_rmse_m - best.inlier_rmse_m
+    chosen, resolved_by = _choose_turn(best, turned, rack, config.rack, hint, intrinsics)
+    in_slot, coverage = _agreement(scan, chosen.T_camera_rack, rack, config.rack)
+    reason = _refusal(chosen, in_slot, coverage, rack, config.rack)
     return RackPose(
-        status,
+        RackStatus.REFUSED if reason else RackStatus.OK,
         reason,
-        chosen.T_camera_rack if status is RackStatus.OK else None,
+        None if reason else chosen.T_camera_rack,
         chosen.inlier_rmse_m,
         chosen.fitness,
         in_slot,
         coverage,
-        ambiguous=resolved_by == "rule" and status is RackStatus.OK,
-        resolved_by=resolved_by if status is RackStatus.OK else "",
+        ambiguous=resolved_by == "rule" and not reason,
+        resolved_by="" if reason else resolved_by,
         turn_margin_m=margin_m if chosen is best else -margin_m,
         spacing_m=spacing_m,
     )
 
 
-def _not_found(
-    points_m: FloatArray, top: RackTop | None, spacing_m: float, rack: RackModel, config: Config
-) -> RackPose:
-    expected = " x ".join(f"{side * 1e3:.1f}" for side in sorted(rack.outline_m, reverse=True))
-    factor = suspect_unit_factor(points_m, rack, config.rack_top)
-    if factor is not None:
-        size = "larger" if factor > 1 else "smaller"
-        times = factor if factor > 1 else 1 / factor
-        return RackPose(
-            RackStatus.UNIT,
-            f"a rack of this shape is there, but {times:g} times {size} than {rack.name} ({expected} mm): "
-            "is the unit of the capture declared right (m or mm)?",
-            spacing_m=spacing_m,
-        )
-    coarse = _too_coarse(spacing_m, rack, config.rack)
+def _not_found(points_m: FloatArray, top: RackTop | None, rack: RackModel, config: RackConfig) -> RackPose:
+    spacing_m = point_spacing_m(points_m)
+    coarse = _too_coarse(spacing_m, rack, config)
     if coarse:
         return RackPose(RackStatus.INSUFFICIENT, coarse, spacing_m=spacing_m)
     found = "no level band" if top is None else f"a band of {top.size_m[0] * 1e3:.1f} x {top.size_m[1] * 1e3:.1f} mm"
     return RackPose(
         RackStatus.NOT_FOUND,
-        f"no top of {rack.name} ({expected} mm) among the points; closest: {found}",
+        f"no top of {rack.name} ({_outline_mm(rack)} mm) among the points; closest: {found}",
         spacing_m=spacing_m,
+    )
+
+
+def _unit_suspicion(points_m: FloatArray, rack: RackModel, config: Config) -> str:
+    """A sentence when the rack is there at another scale, accepted by every test that a pose has to pass."""
+    for factor in plausible_unit_factors(points_m, rack):
+        if _register(points_m / factor, rack, config, None, None).status is RackStatus.OK:
+            size = f"{factor:g} times larger" if factor > 1 else f"{1 / factor:g} times smaller"
+            return (
+                f"a rack of this shape is there, but {size} than {rack.name} ({_outline_mm(rack)} mm): "
+                "is the unit of the capture declared right (m or mm)?"
+            )
+    return ""
+
+
+def _outline_mm(rack: RackModel) -> str:
+    return " x ".join(f"{side:g}" for side in rack.outline_mm)
+
+
+def _too_noisy(noise_m: float, reason: str, config: RackConfig) -> str:
+    return (
+        f"depth scatters by {noise_m * 1e3:.1f} mm on level patches, "
+        f"at most {config.max_inlier_rmse_m * 1e3:.1f} mm can be registered ({reason})"
     )
 
 
@@ -172,22 +196,29 @@ def _too_coarse(spacing_m: float, rack: RackModel, config: RackConfig) -> str:
     if spacing_m <= limit_m:
         return ""
     return (
-        f"insufficient data: points are {spacing_m * 1e3:.2f} mm apart, and the ribs of {rack.name} are "
+        f"points are {spacing_m * 1e3:.2f} mm apart, and the ribs of {rack.name} are "
         f"{rack.min_rib_m * 1e3:.2f} mm wide; a finer or nearer scan is needed"
     )
 
 
 def _hypotheses(top: RackTop, band_m: FloatArray, rack: RackModel) -> list[FloatArray]:
-    """Every right-handed assignment of the OBB's axes to the rack's with z up, as T_camera_rack."""
+    """Every right-handed assignment of the OBB's axes to the rack's with z up, as T_camera_rack.
+
+    Open3D gives the box's axes in any order and sign. Assignments that swap clearly different sides are left out.
+    """
     box = to_o3d(band_m).get_minimal_oriented_bounding_box()
     up = top.T_camera_top[:3, 2]
     found = []
     for order in permutations(range(3)):
+        sides_m = box.extent[list(order[:2])]
+        if np.max(np.abs(sides_m - rack.outline_m) / rack.outline_m) > 0.25:
+            continue
         for signs in product((1.0, -1.0), repeat=3):
             R = box.R[:, order] * np.array(signs)
             if np.linalg.det(R) > 0 and R[:, 2] @ up > np.cos(np.deg2rad(30)):
                 found.append(make_transform(R, box.center - rack.height_m * R[:, 2]))
-    return found
+    # The box of a very oblique or tiny patch can be useless: the rectangle of the band is the same start.
+    return found or [top.T_camera_top @ make_transform(np.eye(3), np.array([0.0, 0.0, -rack.height_m]))]
 
 
 def _register_all(
@@ -197,10 +228,11 @@ def _register_all(
     template_m = rack_template_m(rack, config.template_spacing_m)
     target = to_o3d(template_m)
     source = to_o3d(scan_m)
+    few = to_o3d(thin(scan_m, config.coarse_points))
     corners = np.array([[x, y, 0.0] for x in (-0.5, 0.5) for y in (-0.5, 0.5)]) * [*top.size_m, 0.0]
     outline_m = np.vstack([scan_m, transform_points(top.T_camera_top, corners)])
     starts = _hypotheses(top, outline_m, rack)
-    coarse = [_icp(source, target, start, config, config.icp_distances_m[:1]) for start in starts]
+    coarse = [_icp(few, target, start, config, config.icp_distances_m[:1]) for start in starts]
     best = max(coarse, key=lambda r: (round(r.fitness, 3), -r.inlier_rmse_m))
     fine = config.icp_distances_m[1:]
     turned_start = best.T_camera_rack @ HALF_TURN
@@ -237,19 +269,19 @@ def _choose_turn(
     config: RackConfig,
     hint: SlotHint | None,
     intrinsics: CameraIntrinsics | None,
-) -> tuple[_Registration, _Registration, str]:
-    """The turn to report, the other one, and what decided."""
+) -> tuple[_Registration, str]:
+    """The turn to report, and what decided."""
     if turned.inlier_rmse_m - best.inlier_rmse_m > config.ambiguous_margin_m:
-        return best, turned, "geometry"
+        return best, "geometry"
     pair = (best, turned)
     if hint is not None and intrinsics is not None:
         point = np.array([*rack.slot(hint.slot).center_m, rack.height_m])
         pixels = [intrinsics.project(transform_points(r.T_camera_rack, point)) for r in pair]
         distances = [float(np.hypot(*(pixel - np.array(hint.pixel)))) for pixel in pixels]
         if abs(distances[0] - distances[1]) > 0.25 * float(np.hypot(*(pixels[0] - pixels[1]))) > 0:
-            return (*(pair if distances[0] < distances[1] else pair[::-1]), "hint")
+            return pair[0 if distances[0] < distances[1] else 1], "hint"
     # Decided by the image's diagonal: racks stand along the image's sides more often than along its diagonal.
-    return (*(pair if best.T_camera_rack[:2, 0].sum() > 0 else pair[::-1]), "rule")
+    return pair[0 if best.T_camera_rack[:2, 0].sum() > 0 else 1], "rule"
 
 
 def _agreement(

@@ -24,7 +24,7 @@ class SlotAssignment:
         slot: Name of the slot, or None if the tube stands on none.
         share: Share of the projected hull's area that lies in that slot's opening.
         reason: Why there is no slot; empty otherwise.
-        points_m: The tube's points, rack frame, shape (N, 3), metres: above the top, and not beyond its own slot's reach.
+        points_m: The tube's points above the rack's top, rack frame, shape (N, 3), metres.
     """
 
     detection: int
@@ -115,11 +115,11 @@ def lean_reach_m(z_m: FloatArray, slot: SlotModel, tube: TubeModel, rack: RackMo
 def crop_to_slot(
     points_m: FloatArray, slot: SlotModel, tube: TubeModel, rack: RackModel, config: SlotConfig
 ) -> FloatArray:
-    """Points (N, 3), rack frame, that a tube in this slot can own: the rest of its box is another tube's (section III)."""
+    """Points (N, 3), rack frame, that a tube in this slot can own; the rest of its box is another tube's."""
     lateral = np.hypot(*(points_m[:, :2] - slot.center_m).T)
     limit = tube.max_radius_m + lean_reach_m(points_m[:, 2], slot, tube, rack) + config.reach_m
     below_top = points_m[:, 2] < rack.floor_m + tube.height_m + 2 * config.reach_m
-    return points_m[(lateral < limit) & below_top]
+    return np.asarray(points_m[(lateral < limit) & below_top])
 
 
 def identify_tube(

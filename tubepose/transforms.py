@@ -32,7 +32,7 @@ def transform_points(T: FloatArray, points_m: FloatArray) -> FloatArray:
 
 
 def tilt_rotation(alpha_rad: float, beta_rad: float) -> FloatArray:
-    """Rotation of Eq. 1, ``Ry(beta) Rx(alpha)``, of shape (3, 3); its third column is the tube's axis in the rack frame."""
+    """Rotation of Eq. 1, ``Ry(beta) Rx(alpha)``, shape (3, 3); its third column is the axis in the rack frame."""
     ca, sa, cb, sb = np.cos(alpha_rad), np.sin(alpha_rad), np.cos(beta_rad), np.sin(beta_rad)
     return np.array([[cb, sb * sa, sb * ca], [0.0, ca, -sa], [-sb, cb * sa, cb * ca]])
 

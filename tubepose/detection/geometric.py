@@ -13,7 +13,7 @@ from tubepose.capture.frame import RgbdFrame
 from tubepose.config import Config
 from tubepose.detection.model import RACK_CLASS, TUBE_CLASS, Detection
 from tubepose.labware import RackModel, TubeModel
-from tubepose.preprocessing import TALLEST_TUBE_M, RackTop, find_rack_top
+from tubepose.preprocessing import TALLEST_TUBE_M, find_rack_top
 from tubepose.transforms import FloatArray, invert_transform, transform_points
 
 CELL_M = 5e-4
@@ -75,8 +75,8 @@ class GeometricDetector:
         found = _cover_by_discs(xy[tops], radius_m, self.config.preprocess.min_tube_points)
         explained = np.zeros(len(xy), bool)
         if len(found):
-            explained = cKDTree(found).query(xy)[0] < 1.5 * radius_m
-        nearest_m, slot = cKDTree(centers_m).query(xy)
+            explained = np.asarray(cKDTree(found).query(xy)[0]) < 1.5 * radius_m
+        nearest_m, slot = (np.asarray(values) for values in cKDTree(centers_m).query(xy))
         loose = ~explained & (nearest_m < 0.35 * pitch_m)
         counts = np.bincount(slot[loose], minlength=len(centers_m))
         unknown = counts >= 2 * self.config.preprocess.min_tube_points
@@ -101,7 +101,7 @@ def _nearest_pitch(centers_m: FloatArray) -> FloatArray:
     """Distance of every slot to its nearest neighbour, shape (S,), metres; a lone slot counts 20 mm."""
     if len(centers_m) == 1:
         return np.array([0.02])
-    return np.asarray(cKDTree(centers_m).query(centers_m, k=2)[0][:, 1])
+    return np.asarray(cKDTree(centers_m).query(centers_m, k=2)[0])[:, 1]
 
 
 def _cover_by_discs(xy_m: FloatArray, radius_m: float, min_points: int) -> FloatArray:

@@ -42,7 +42,10 @@ class Detection:
 class Detector(Protocol):
     """A source of boxes."""
 
-    name: str
+    @property
+    def name(self) -> str:
+        """Name in the tables: ``geometric``, ``yolo`` or ``recorded``."""
+        ...
 
     def detect(self, frame: RgbdFrame) -> tuple[Detection, ...]:
         """Find racks and tubes in a frame.

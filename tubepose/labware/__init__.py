@@ -1,7 +1,8 @@
 """Racks, tubes and printed caps: definitions in YAML, a built-in catalogue, and the geometry that follows from them."""
 
-from tubepose.labware.models import CapModel, RackModel, SlotModel, TubeModel
+from tubepose.labware.racks import RackModel, SlotModel
 from tubepose.labware.reading import Labware, catalogue, load_cap, load_rack, load_tube, read_labware
+from tubepose.labware.tubes import CapModel, TubeModel
 
 __all__ = [
     "CapModel",

@@ -9,7 +9,9 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Polygon, Rectangle
 
-from tubepose.labware.models import MM, CapModel, RackModel, SlotModel, TubeModel
+from tubepose.labware.definition import MM
+from tubepose.labware.racks import RackModel, SlotModel
+from tubepose.labware.tubes import CapModel, TubeModel
 from tubepose.transforms import FloatArray
 
 _LINE: dict[str, Any] = {"edgecolor": "black", "linewidth": 0.8}

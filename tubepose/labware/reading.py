@@ -13,7 +13,8 @@ import yaml
 from pydantic import BaseModel, ValidationError
 
 from tubepose.errors import LabwareError, TubePoseError
-from tubepose.labware.models import CapModel, RackModel, TubeModel
+from tubepose.labware.racks import RackModel
+from tubepose.labware.tubes import CapModel, TubeModel
 
 Labware = RackModel | TubeModel | CapModel
 _KINDS: dict[str, type[Labware]] = {"rack": RackModel, "tube": TubeModel, "cap": CapModel}

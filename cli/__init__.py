@@ -1,0 +1,1 @@
+"""The `tubepose` command line: parse, call, show. Installed as `tubepose_cli`."""

@@ -1,0 +1,154 @@
+"""`tubepose bench`."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    import pandas as pd
+
+    from tubepose.batch import Job, Tables
+    from tubepose.config import Config
+    from tubepose_cli.truth import MeasuredTruth
+
+ALL_METHODS = "upright,paper,slot-icp,global-icp"
+
+
+def bench(
+    sessions: Annotated[list[Path] | None, typer.Argument(help="Session folders; default: the bundled sample.")] = None,
+    out: Annotated[Path, typer.Option(help="Folder for the results; nothing is written anywhere else.")] = Path(
+        "out/bench"
+    ),
+    methods: Annotated[str, typer.Option(help="Methods with commas; 'upright' is the trivial answer.")] = ALL_METHODS,
+    seeds: Annotated[int, typer.Option(min=1, help="Seeds of a stochastic method: 0 to N-1.")] = 3,
+    detector: Annotated[str, typer.Option(help="Source of boxes: geometric, yolo or recorded.")] = "geometric",
+    model: Annotated[Path | None, typer.Option(help="ONNX file of --detector yolo.")] = None,
+    boxes: Annotated[Path | None, typer.Option(help="Boxes of --detector recorded: YOLO txt or COCO json.")] = None,
+    classes: Annotated[Path | None, typer.Option(help="Class names of the boxes or the model, one a line.")] = None,
+    layout: Annotated[str | None, typer.Option(help="Output layout of the model, where it cannot be told.")] = None,
+    config: Annotated[Path | None, typer.Option(help="YAML file that changes defaults (docs/method.md).")] = None,
+    overlays: Annotated[bool, typer.Option(help="Write one overlay picture per frame.")] = False,
+    published: Annotated[bool, typer.Option("--published", help="Add the paper's own figures to the tables.")] = False,
+    fail_fast: Annotated[bool, typer.Option("--fail-fast", help="Stop at the first bad capture.")] = False,
+) -> None:
+    """Run every method on sessions, compare with the ground truth, and print the paper's two tables.
+
+    Writes what estimate and gt write, and errors.csv, summary.csv, comparison.csv, seeds.csv,
+    table_accuracy.{csv,md,tex} and table_timing.{csv,md,tex} into --out.
+    """
+    from tubepose.batch import session_jobs
+    from tubepose.config import load_config
+    from tubepose.errors import TubePoseError
+    from tubepose_cli.inputs import find_sessions, make_detector, read_methods, sample_session
+    from tubepose_cli.results import run_estimates
+    from tubepose_cli.show import finish
+    from tubepose_cli.truth import measure_sessions
+
+    settings = load_config(config)
+    names = read_methods(methods)
+    detector_for = make_detector(detector, model, boxes, classes, layout, settings)
+    folders: list[Path] = []
+    jobs: list[Job] = []
+    problems: list[str] = []
+    for path in sessions or [sample_session()]:
+        try:
+            folders += find_sessions([path])
+        except TubePoseError as problem:
+            if fail_fast:
+                raise
+            problems.append(str(problem))
+    measured = measure_sessions(folders, out, fail_fast=fail_fast)
+    for session in measured.sessions:
+        found, unread = session_jobs(session)
+        jobs += found
+        problems += unread
+    tables = run_estimates(
+        jobs, names, detector_for, settings, out, sys.argv, seeds=seeds, overlays=overlays, fail_fast=fail_fast,
+        warm_up=True, inputs=[path for path in (model, boxes, config) if path is not None], detector=detector,
+        ground_truth_config=measured.config,
+    )  # fmt: skip
+    if len(measured.truth):
+        _report(tables, measured, jobs, names, settings, out, seeds, published)
+    finish([*problems, *measured.problems, *tables.problems])
+
+
+def _report(
+    tables: Tables, measured: MeasuredTruth, jobs: Sequence[Job], methods: Sequence[str], config: Config, out: Path,
+    seeds: int, published: bool,
+) -> None:  # fmt: skip
+    """Evaluate, write and print."""
+    from tubepose.batch import ESTIMATE_COLUMNS, TIMING_COLUMNS, to_table
+    from tubepose.evaluation import compare, evaluate, seed_spread, summarise
+    from tubepose.pipeline import STOCHASTIC
+    from tubepose.report.tables import accuracy_table, timing_table
+    from tubepose.report.writing import write_csv, write_table
+    from tubepose_cli.show import say, show_table
+
+    estimates = to_table(tables.estimates, ESTIMATE_COLUMNS)
+    tube_models = {tube.name: tube for session in measured.sessions for tube in session.tubes.values()}
+    errors = evaluate(estimates, measured.truth, tube_models, methods)
+    summary = summarise(errors, methods)
+    write_csv(out / "errors.csv", errors)
+    write_csv(out / "summary.csv", summary)
+    reference = "paper" if "paper" in methods else methods[0]
+    write_csv(out / "comparison.csv", compare(errors, reference))
+    write_csv(out / "seeds.csv", seed_spread(errors))
+    notes = [_data_note(measured, jobs), *measured.notes, *_rack_notes(tables)]
+    if any(method in STOCHASTIC for method in methods):
+        notes += [*_rival_notes(config, seeds), *_spread_notes(seed_spread(errors))]
+    accuracy = accuracy_table(summary, notes, published)
+    timing = timing_table(to_table(tables.timings, TIMING_COLUMNS), [_machine_note()], published)
+    for name, table in (("table_accuracy", accuracy), ("table_timing", timing)):
+        write_table(out, name, table)
+        show_table(table.cells, table.caption, table.notes)
+    say(f"all tables and rows: {out}")
+
+
+def _data_note(measured: MeasuredTruth, jobs: Sequence[Job]) -> str:
+    kinds = sorted({session.origin for session in measured.sessions})
+    sensors = sorted({session.sensor for session in measured.sessions})
+    racks = sorted({job.rack.name for job in jobs})
+    kind = "SIMULATED data, no real scan" if kinds == ["simulated"] else " and ".join(kinds) + " data"
+    seen = f"sensor {', '.join(sensors)}; rack {', '.join(racks)}, its pose estimated, not given"
+    return f"{kind}: {len(jobs)} captures; {seen}."
+
+
+def _rack_notes(tables: Tables) -> list[str]:
+    frames = {(row["session"], row["capture"], row["frame"]): row["status"] for row in tables.racks}
+    ok = sum(status == "ok" for status in frames.values())
+    return [f"Racks: {ok} of {len(frames)} frames with an accepted pose."]
+
+
+def _rival_notes(config: Config, seeds: int) -> list[str]:
+    icp = config.icp
+    rounds = ", ".join(f"{distance * 1e3:g}" for distance in icp.max_distance_m)
+    return [
+        f"global-icp: Open3D FPFH (radius {icp.feature_radius_m * 1e3:g} mm, normals {icp.normal_radius_m * 1e3:g} mm, "
+        f"voxel {icp.voxel_m * 1e3:g} mm) + RANSAC "
+        f"({icp.ransac_iterations} iterations, {icp.ransac_distance_m * 1e3:g} mm), "
+        f"{seeds} seeds; then ICP {icp.estimation}, distances {rounds} mm, as slot-icp. No rejection in either.",
+    ]
+
+
+def _spread_notes(spread: pd.DataFrame) -> list[str]:
+    rows = [row for row in spread.to_dict("records") if row["n_seeds"] > 1]
+    if not rows:
+        return []
+    told = "; ".join(
+        f"{row['method']} {row['tube']} {row['tilt_deg_mean_min']:.2f} to {row['tilt_deg_mean_max']:.2f} deg"
+        for row in rows
+    )
+    return [f"Mean tilt error of single seeds, least to most: {told}."]
+
+
+def _machine_note() -> str:
+    from tubepose.provenance import machine
+
+    found = machine()
+    return f"{found['cpu']}, {found['cores']} cores, one thread used."

@@ -1,0 +1,85 @@
+"""`tubepose estimate`."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+
+def estimate(
+    captures: Annotated[
+        list[Path], typer.Argument(help="Capture folders, .ply or .mcap files, session folders, or folders of those.")
+    ],
+    out: Annotated[Path, typer.Option(help="Folder for the results; nothing is written anywhere else.")],
+    rack: Annotated[str | None, typer.Option(help="Rack by name or YAML file; a session knows its own.")] = None,
+    tubes: Annotated[
+        str | None, typer.Option(help="Kinds of tube that can be there: names or files, with commas.")
+    ] = None,
+    method: Annotated[str, typer.Option(help="paper, upright, slot-icp or global-icp.")] = "paper",
+    detector: Annotated[str, typer.Option(help="Source of boxes: geometric, yolo or recorded.")] = "geometric",
+    model: Annotated[Path | None, typer.Option(help="ONNX file of --detector yolo.")] = None,
+    boxes: Annotated[Path | None, typer.Option(help="Boxes of --detector recorded: YOLO txt or COCO json.")] = None,
+    classes: Annotated[Path | None, typer.Option(help="Class names of the boxes or the model, one a line.")] = None,
+    layout: Annotated[str | None, typer.Option(help="Output layout of the model, where it cannot be told.")] = None,
+    unit: Annotated[str | None, typer.Option(help="Unit of a bare .ply file: m (default) or mm.")] = None,
+    cloud_topic: Annotated[str | None, typer.Option(help="Topic of the clouds in an .mcap file.")] = None,
+    depth_topic: Annotated[str | None, typer.Option(help="Topic of the depth images in an .mcap file.")] = None,
+    image_topic: Annotated[str | None, typer.Option(help="Topic of the images in an .mcap file.")] = None,
+    info_topic: Annotated[str | None, typer.Option(help="Topic of the CameraInfo in an .mcap file.")] = None,
+    hint: Annotated[
+        str | None, typer.Option(help="Which way round the rack stands: SLOT@U,V, a slot and its pixel.")
+    ] = None,
+    seeds: Annotated[int, typer.Option(min=1, help="Seeds of a stochastic method: 0 to N-1.")] = 1,
+    config: Annotated[Path | None, typer.Option(help="YAML file that changes defaults (docs/method.md).")] = None,
+    overlays: Annotated[bool, typer.Option(help="Write one overlay picture per frame.")] = True,
+    fail_fast: Annotated[bool, typer.Option("--fail-fast", help="Stop at the first bad capture.")] = False,
+) -> None:
+    """Estimate the pose of the rack and of every tube in recorded captures.
+
+    Writes racks.csv, slots.csv, estimates.csv, timings.csv, run.json and overlays/ into --out.
+    """
+    from tubepose.batch import Job
+    from tubepose.config import load_config
+    from tubepose.errors import TubePoseError
+    from tubepose.labware import load_rack
+    from tubepose_cli.inputs import capture_jobs, make_detector, read_methods, read_tubes
+    from tubepose_cli.results import run_estimates
+    from tubepose_cli.show import finish, say
+
+    settings = load_config(config)
+    rack_model = load_rack(rack) if rack is not None else None
+    tube_models = read_tubes(tubes) if tubes is not None else ()
+    methods = read_methods(method)
+    detector_for = make_detector(detector, model, boxes, classes, layout, settings)
+    topics = {"cloud": cloud_topic, "depth": depth_topic, "image": image_topic, "info": info_topic}
+    jobs: list[Job] = []
+    problems: list[str] = []
+    for path in captures:
+        try:
+            found, unread = capture_jobs(path, rack_model, tube_models, unit=unit, hint=hint, topics=topics)
+            jobs += found
+            problems += unread
+        except TubePoseError as problem:
+            if fail_fast:
+                raise
+            problems.append(str(problem))
+    tables = run_estimates(
+        jobs, methods, detector_for, settings, out, sys.argv, seeds=seeds, overlays=overlays, fail_fast=fail_fast,
+        inputs=[path for path in (model, boxes, config) if path is not None], detector=detector,
+    )  # fmt: skip
+    for row in tables.racks:
+        turn = ", turn ambiguous by 180 degrees" if row["ambiguous"] else ""
+        if row["status"] == "ok":
+            found = f"ok, inlier rmse {row['inlier_rmse_m'] * 1e3:.2f} mm{turn}"
+        else:
+            found = f"{row['status']}: {row['reason']}"
+        held = sum(
+            e["status"] == "ok"
+            for e in tables.estimates
+            if (e["capture"], e["frame"]) == (row["capture"], row["frame"])
+        )
+        say(f"{row['capture']} frame {row['frame']}: rack {row['rack']} {found}; {held} tubes ok")
+    finish([*problems, *tables.problems])

@@ -1,0 +1,45 @@
+"""`tubepose gt`."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+
+def gt(
+    sessions: Annotated[list[Path], typer.Argument(help="Session folders.")],
+    out: Annotated[Path, typer.Option(help="Folder for the results.")],
+    fail_fast: Annotated[bool, typer.Option("--fail-fast", help="Stop at the first bad capture.")] = False,
+) -> None:
+    """Measure the true poses of tubes from their printed caps (plane segmentation + square template ICP).
+
+    Writes ground_truth.csv and run.json into --out; on simulated sessions ground_truth_floor.csv too, its error against
+    the exact truth.
+    """
+    from tubepose.config import Config
+    from tubepose.errors import TubePoseError
+    from tubepose.provenance import run_record
+    from tubepose.report.writing import write_json
+    from tubepose_cli.inputs import find_sessions
+    from tubepose_cli.show import finish, say
+    from tubepose_cli.truth import measure_sessions
+
+    problems: list[str] = []
+    folders: list[Path] = []
+    for path in sessions:
+        try:
+            folders += find_sessions([path])
+        except TubePoseError as problem:
+            if fail_fast:
+                raise
+            problems.append(str(problem))
+    measured = measure_sessions(folders, out, fail_fast=fail_fast)
+    labware = [item for session in measured.sessions for item in (session.rack, *session.tubes.values())]
+    record = run_record(sys.argv, Config(), labware, folders, ground_truth_config=measured.config)
+    write_json(out / "run.json", record)
+    for line in measured.notes:
+        say(line)
+    finish([*problems, *measured.problems])

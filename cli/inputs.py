@@ -1,0 +1,139 @@
+"""From what was typed to what is run: captures, sessions, racks, tubes, detectors."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from tubepose.batch import DetectorFactory, Job
+    from tubepose.capture.session import SlotHint
+    from tubepose.config import Config
+    from tubepose.labware import RackModel, TubeModel
+
+SAMPLE = "sample"
+
+
+def sample_session() -> Path:
+    """Folder of the bundled (simulated) sample session."""
+    from importlib.resources import files
+
+    from tubepose.errors import CaptureError
+
+    folder = Path(str(files("tubepose"))) / SAMPLE
+    if not (folder / "session.yaml").is_file():
+        raise CaptureError(f"{folder}: the bundled sample is missing; give a session folder")
+    return folder
+
+
+def read_tubes(names: str) -> tuple[TubeModel, ...]:
+    """Tube models of a comma-separated list of names and files."""
+    from tubepose.labware import load_tube
+
+    return tuple(load_tube(name.strip()) for name in names.split(",") if name.strip())
+
+
+def read_methods(names: str) -> tuple[str, ...]:
+    """Methods of a comma-separated list."""
+    from tubepose.errors import ConfigError
+    from tubepose.pipeline import METHODS
+
+    methods = tuple(dict.fromkeys(name.strip() for name in names.split(",") if name.strip()))
+    unknown = [name for name in methods if name not in METHODS]
+    if unknown or not methods:
+        raise ConfigError(f"unknown method '{', '.join(unknown)}'; known: {', '.join(METHODS)}")
+    return methods
+
+
+def find_sessions(paths: Sequence[Path]) -> list[Path]:
+    """Session folders at or below the given paths."""
+    from tubepose.capture.session import is_session
+    from tubepose.errors import CaptureError
+
+    sessions: list[Path] = []
+    for path in paths:
+        folder = path.parent if path.name == "session.yaml" else path
+        found = [folder] if is_session(folder) else sorted(p.parent for p in folder.glob("*/session.yaml"))
+        if not found:
+            raise CaptureError(f"{path}: no session.yaml there or one folder below; see docs/capture-format.md")
+        sessions += found
+    return sessions
+
+
+def capture_jobs(
+    path: Path,
+    rack: RackModel | None,
+    tubes: tuple[TubeModel, ...],
+    *,
+    unit: str | None = None,
+    hint: str | None = None,
+    topics: Mapping[str, str | None] | None = None,
+) -> tuple[list[Job], list[str]]:
+    """Jobs of one typed path (a session's trials, or the captures found there), and what could not be opened.
+
+    `rack` and `tubes` win over what a session says.
+    """
+    from tubepose.batch import Job, session_jobs
+    from tubepose.capture.session import SESSION_FILE, is_session, load_session
+    from tubepose.capture.source import open_captures
+    from tubepose.errors import CaptureError, ConfigError
+
+    if path.name == SESSION_FILE or (path.is_dir() and is_session(path)):
+        jobs, problems = session_jobs(load_session(path))
+        changed = [replace(job, rack=rack or job.rack, tubes=tubes or job.tubes) for job in jobs]
+        return changed, list(problems)
+    if not path.exists():
+        raise CaptureError(f"{path}: no such file or folder")
+    if rack is None:
+        raise ConfigError(
+            f"{path}: not a session, so the rack must be named: --rack NAME|FILE (see 'tubepose labware list')"
+        )
+    told = read_hint(hint, rack) if hint is not None else None
+    topic = {f"{kind}_topic": name for kind, name in (topics or {}).items()}
+    return [Job(capture, rack, tubes, told) for capture in open_captures(path, unit=unit, **topic)], []
+
+
+def read_hint(text: str, rack: RackModel) -> SlotHint:
+    """The hint SLOT@U,V."""
+    from tubepose.capture.session import SlotHint
+    from tubepose.errors import ConfigError
+
+    slot, _, pixel = text.partition("@")
+    try:
+        u, v = (float(value) for value in pixel.split(","))
+    except ValueError:
+        raise ConfigError(f"--hint {text}: expected SLOT@U,V, for example A1@412,300") from None
+    if slot not in {known.name for known in rack.all_slots}:
+        raise ConfigError(f"--hint {text}: no slot {slot} in rack {rack.name}")
+    return SlotHint(slot=slot, pixel=(u, v))
+
+
+def make_detector(
+    name: str, model: Path | None, boxes: Path | None, classes: Path | None, layout: str | None, config: Config
+) -> DetectorFactory:
+    """Source of boxes by name; the files are read once, before the first capture."""
+    from tubepose.errors import ConfigError
+
+    if name == "geometric":
+        from tubepose.detection.geometric import GeometricDetector
+
+        return lambda rack, tubes: GeometricDetector(rack, tubes, config)
+    if name == "yolo":
+        if model is None:
+            raise ConfigError("--detector yolo needs --model FILE.onnx (see docs/detectors.md for how to export one)")
+        from tubepose.detection.box_files import read_class_names
+        from tubepose.detection.yolo import YoloDetector
+
+        names = read_class_names(classes) if classes is not None else None
+        yolo = YoloDetector(model, classes=names, layout=layout)
+        return lambda _rack, _tubes: yolo
+    if name == "recorded":
+        if boxes is None:
+            raise ConfigError("--detector recorded needs --boxes PATH (YOLO txt folder or file, or COCO json)")
+        from tubepose.detection.recorded import RecordedDetector
+
+        recorded = RecordedDetector(boxes, classes=classes)
+        return lambda _rack, _tubes: recorded
+    raise ConfigError(f"unknown detector '{name}'; known: geometric, yolo, recorded")

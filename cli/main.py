@@ -1,0 +1,51 @@
+"""The `tubepose` command. Heavy imports stay inside the commands, so that `--help` is quick."""
+
+from __future__ import annotations
+
+import sys
+from typing import Annotated
+
+import typer
+
+from tubepose import __version__
+from tubepose.errors import TubePoseError
+from tubepose_cli import labware
+from tubepose_cli.bench import bench
+from tubepose_cli.estimate import estimate
+from tubepose_cli.gt import gt
+from tubepose_cli.simulate import simulate
+
+app = typer.Typer(
+    name="tubepose",
+    help="Poses of in-rack test tubes from recorded RGB-D captures.",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+)
+for _command in (estimate, gt, bench, simulate):
+    app.command()(_command)
+app.add_typer(labware.app, name="labware")
+
+
+def _show_version(wanted: bool) -> None:
+    if wanted:
+        typer.echo(f"tubepose {__version__}")
+        raise typer.Exit
+
+
+@app.callback()
+def main(
+    version: Annotated[
+        bool, typer.Option("--version", callback=_show_version, is_eager=True, help="Show the version and exit.")
+    ] = False,
+) -> None:
+    """Poses of in-rack test tubes from recorded RGB-D captures."""
+
+
+def run() -> None:
+    """Entry point: an error that the user can correct is one line on stderr and exit 1; a wrong usage is exit 2."""
+    try:
+        app()
+    except TubePoseError as problem:
+        print(f"error: {' '.join(str(problem).split())}", file=sys.stderr)
+        sys.exit(1)

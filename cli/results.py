@@ -1,0 +1,80 @@
+"""Result folders: the tables of a run, its record and its pictures, each file written whole or not at all."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from tubepose.batch import DetectorFactory, Job, Tables
+    from tubepose.config import Config
+    from tubepose.labware import Labware
+    from tubepose.pipeline import Scene, TubeEstimate
+
+
+def run_estimates(
+    jobs: Sequence[Job],
+    methods: Sequence[str],
+    detector_for: DetectorFactory,
+    config: Config,
+    out: Path,
+    command: Sequence[str],
+    *,
+    seeds: int = 1,
+    overlays: bool = True,
+    fail_fast: bool = False,
+    warm_up: bool = False,
+    inputs: Sequence[Path] = (),
+    **more: Any,
+) -> Tables:
+    """Run jobs and write racks.csv, slots.csv, estimates.csv, timings.csv, run.json and overlays/ into `out`."""
+    from tubepose.batch import ESTIMATE_COLUMNS, RACK_COLUMNS, SLOT_COLUMNS, TIMING_COLUMNS, run_jobs, to_table
+    from tubepose.provenance import pinned_threads, run_record
+    from tubepose.report.writing import write_csv, write_json
+    from tubepose_cli.show import progress
+
+    def draw(job: Job, scene: Scene, estimates: tuple[TubeEstimate, ...]) -> None:
+        if overlays:
+            write_overlay(out / "overlays", job, scene, estimates)
+
+    out.mkdir(parents=True, exist_ok=True)
+    with pinned_threads(1), progress("captures", len(jobs)) as step:
+        tables = run_jobs(
+            jobs, methods, detector_for, config, seeds=seeds, warm_up=warm_up, fail_fast=fail_fast,
+            on_scene=draw, on_done=step,
+        )  # fmt: skip
+    write_csv(out / "racks.csv", to_table(tables.racks, RACK_COLUMNS))
+    write_csv(out / "slots.csv", to_table(tables.slots, SLOT_COLUMNS))
+    write_csv(out / "estimates.csv", to_table(tables.estimates, ESTIMATE_COLUMNS))
+    write_csv(out / "timings.csv", to_table(tables.timings, TIMING_COLUMNS))
+    labware: dict[str, Labware] = {}
+    for job in jobs:
+        labware[job.rack.name] = job.rack
+        labware.update({tube.name: tube for tube in job.tubes})
+    record = run_record(
+        command,
+        config,
+        list(labware.values()),
+        [*inputs, *dict.fromkeys(job.capture.path for job in jobs if job.capture.path.exists())],
+        methods=list(methods),
+        seeds=list(range(seeds)),
+        threads=1,
+        problems=tables.problems,
+        **more,
+    )
+    write_json(out / "run.json", record)
+    return tables
+
+
+def write_overlay(folder: Path, job: Job, scene: Scene, estimates: Sequence[TubeEstimate]) -> None:
+    """One overlay picture, named by capture and frame."""
+    import cv2
+
+    from tubepose.report.overlay import draw_overlay
+    from tubepose.report.writing import write_bytes
+
+    folder.mkdir(parents=True, exist_ok=True)
+    name = "-".join(part for part in (job.session, scene.frame.capture) if part).replace("/", "_")
+    _, png = cv2.imencode(".png", draw_overlay(scene, estimates))
+    write_bytes(folder / f"{name}-{scene.frame.index:04d}.png", png.tobytes())

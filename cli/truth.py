@@ -1,0 +1,77 @@
+"""Ground truth for the commands `gt` and `bench`: measured, written, summed up in words."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+    from tubepose.capture.session import Session
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MeasuredTruth:
+    """What was measured.
+
+    Attributes:
+        sessions: The sessions that could be read.
+        truth: Table of ground_truth.csv.
+        floor: Table of ground_truth_floor.csv; empty without a simulated session.
+        notes: In words.
+        problems: One line per session or trial that could not be done.
+        config: The thresholds that were used.
+    """
+
+    sessions: tuple[Session, ...]
+    truth: pd.DataFrame
+    floor: pd.DataFrame
+    notes: tuple[str, ...]
+    problems: tuple[str, ...]
+    config: dict[str, Any]
+
+
+def measure_sessions(folders: Sequence[Path], out: Path, *, fail_fast: bool = False) -> MeasuredTruth:
+    """Measure all sessions and write ground_truth.csv (and ground_truth_floor.csv if one is simulated) into `out`."""
+    from dataclasses import asdict
+
+    from tubepose.batch import to_table
+    from tubepose.capture.session import load_session
+    from tubepose.errors import TubePoseError
+    from tubepose.ground_truth import GroundTruthConfig
+    from tubepose.provenance import pinned_threads
+    from tubepose.report.writing import write_csv
+    from tubepose.truth_tables import (
+        FLOOR_COLUMNS,
+        TRUTH_COLUMNS,
+        TruthTables,
+        floor_note,
+        measure_session,
+        refused_note,
+    )
+    from tubepose_cli.show import progress
+
+    sessions, problems = [], []
+    for folder in folders:
+        try:
+            sessions.append(load_session(folder))
+        except TubePoseError as problem:
+            if fail_fast:
+                raise
+            problems.append(str(problem))
+    config = GroundTruthConfig()
+    tables = TruthTables()
+    with pinned_threads(1), progress("ground truth", sum(len(s.trials) for s in sessions)) as step:
+        for session in sessions:
+            measure_session(session, tables, config, fail_fast=fail_fast, on_done=step)
+    out.mkdir(parents=True, exist_ok=True)
+    truth, floor = to_table(tables.truth, TRUTH_COLUMNS), to_table(tables.floor, FLOOR_COLUMNS)
+    write_csv(out / "ground_truth.csv", truth)
+    notes = [refused_note(truth)]
+    if len(floor):
+        write_csv(out / "ground_truth_floor.csv", floor)
+        notes.append(floor_note(floor))
+    return MeasuredTruth(tuple(sessions), truth, floor, tuple(notes), (*problems, *tables.problems), asdict(config))

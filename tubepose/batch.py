@@ -1,0 +1,313 @@
+"""Many captures through the pipeline: what to run, and tidy rows of what came out (docs/outputs.md).
+
+One bad capture never stops a batch: its one-line problem is kept, and the next one is done.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from tubepose.capture.frame import RgbdFrame
+from tubepose.capture.session import Session, SlotHint, Trial
+from tubepose.capture.source import Capture, open_captures
+from tubepose.config import Config
+from tubepose.detection import Detector
+from tubepose.errors import CaptureError, TubePoseError
+from tubepose.labware import RackModel, TubeModel
+from tubepose.pipeline import STOCHASTIC, Scene, StageTime, TubeEstimate, estimate_tubes, prepare_scene
+from tubepose.rack import RackStatus
+from tubepose.transforms import FloatArray, quaternion_wxyz, tilt_rad
+
+Row = dict[str, Any]
+DetectorFactory = Callable[[RackModel, tuple[TubeModel, ...]], Detector]
+POSE_COLUMNS = ("tx_m", "ty_m", "tz_m", "qw", "qx", "qy", "qz")
+
+
+@dataclass(frozen=True, slots=True)
+class Job:
+    """One capture and what is known about it.
+
+    Attributes:
+        capture: Where its frames come from.
+        rack: The rack that stands in it.
+        tubes: The kinds of tube that can stand in it.
+        hint: Which way round the rack stands, if known.
+        session: Name of its session, or empty.
+        trial: Name of its trial, or empty.
+    """
+
+    capture: Capture
+    rack: RackModel
+    tubes: tuple[TubeModel, ...]
+    hint: SlotHint | None = None
+    session: str = ""
+    trial: str = ""
+
+
+@dataclass(slots=True)
+class Tables:
+    """Rows of the result files, in the order in which they came.
+
+    Attributes:
+        racks: One per frame and method.
+        slots: One per frame, method and slot.
+        estimates: One per frame, method, seed and detected tube.
+        timings: One per timed stage instance.
+        problems: One line per capture that could not be finished.
+    """
+
+    racks: list[Row] = field(default_factory=list)
+    slots: list[Row] = field(default_factory=list)
+    estimates: list[Row] = field(default_factory=list)
+    timings: list[Row] = field(default_factory=list)
+    problems: list[str] = field(default_factory=list)
+
+
+RACK_COLUMNS = (
+    "session", "trial", "capture", "frame", "timestamp_ns", "method", "rack", "status", "reason", "ambiguous",
+    "resolved_by", "turn_margin_m", "inlier_rmse_m", "fitness", "in_slot_share", "coverage", "spacing_m",
+    "n_tubes_detected", *POSE_COLUMNS,
+)  # fmt: skip
+SLOT_COLUMNS = (
+    "session",
+    "trial",
+    "capture",
+    "frame",
+    "method",
+    "slot",
+    "occupied",
+    "tube",
+    "share",
+    "n_points",
+    "status",
+    "reason",
+)
+ESTIMATE_COLUMNS = (
+    "session", "trial", "capture", "frame", "timestamp_ns", "method", "seed", "slot", "tube", "status", "reason",
+    "score", *POSE_COLUMNS, "tilt_deg", "inlier_rmse_m", "fitness", "n_points",
+)  # fmt: skip
+TIMING_COLUMNS = (
+    "session",
+    "trial",
+    "capture",
+    "frame",
+    "method",
+    "seed",
+    "stage",
+    "instance",
+    "duration_ms",
+    "warmup",
+)
+_WHOLE = ("timestamp_ns", "seed")
+
+
+def to_table(rows: Sequence[Row], columns: Sequence[str]) -> pd.DataFrame:
+    """Rows as a table with exactly these columns; stamps and seeds stay whole numbers (Int64)."""
+    table = pd.DataFrame(list(rows), columns=list(columns))
+    return table.astype({name: "Int64" for name in _WHOLE if name in columns})
+
+
+def session_jobs(session: Session) -> tuple[list[Job], list[str]]:
+    """One job per trial, on the capture with the original caps; and one line per trial whose capture is not there."""
+    jobs, problems = [], []
+    for trial in session.trials:
+        try:
+            capture = trial_capture(session, trial, trial.original)
+        except CaptureError as problem:
+            problems.append(str(problem))
+            continue
+        jobs.append(Job(capture, session.rack, session.tubes_of(trial), trial.hint, session.name, trial.name))
+    return jobs, problems
+
+
+def trial_capture(session: Session, trial: Trial, relative: str) -> Capture:
+    """The one capture that a trial names.
+
+    Raises:
+        CaptureError: It is not there, or it is a folder of several.
+    """
+    found = open_captures(session.folder / relative)
+    if len(found) != 1:
+        raise CaptureError(f"{session.folder / relative}: trial {trial.name} needs one capture, found {len(found)}")
+    return found[0]
+
+
+def run_jobs(
+    jobs: Sequence[Job],
+    methods: Sequence[str],
+    detector_for: DetectorFactory,
+    config: Config,
+    *,
+    seeds: int = 1,
+    warm_up: bool = False,
+    fail_fast: bool = False,
+    on_scene: Callable[[Job, Scene, tuple[TubeEstimate, ...]], None] | None = None,
+    on_done: Callable[[], None] | None = None,
+) -> Tables:
+    """Run the methods on every frame of every job.
+
+    Args:
+        jobs: What to run.
+        methods: Names in `pipeline.METHODS`.
+        detector_for: Makes the source of boxes for a rack and the tubes that can stand in it.
+        config: All sections.
+        seeds: Seeds of a stochastic method: 0, 1, ... (a deterministic method runs once).
+        warm_up: Run the first frame once more before, with its timings marked.
+        fail_fast: Raise the first problem instead of keeping it.
+        on_scene: Called with each frame's result (overlays).
+        on_done: Called after each job (progress).
+    """
+    tables = Tables()
+    for job in jobs:
+        try:
+            for frame, load_ms in _timed_frames(job.capture):
+                if warm_up:
+                    warm_up = False
+                    _run_frame(job, frame, methods, detector_for, config, seeds, Tables(), tables.timings)
+                load = StageTime("load", "all", "", None, load_ms)
+                _run_frame(job, frame, methods, detector_for, config, seeds, tables, None, load, on_scene)
+        except TubePoseError as problem:
+            if fail_fast:
+                raise
+            tables.problems.append(_one_line(job, problem))
+        if on_done is not None:
+            on_done()
+    return tables
+
+
+def _one_line(job: Job, problem: TubePoseError) -> str:
+    text = str(problem)
+    return text if str(job.capture.path) in text else f"{job.capture.name}: {text}"
+
+
+def _timed_frames(capture: Capture) -> Iterator[tuple[RgbdFrame, float]]:
+    frames = capture.frames()
+    while True:
+        start = time.perf_counter_ns()
+        frame = next(frames, None)
+        if frame is None:
+            return
+        yield frame, (time.perf_counter_ns() - start) / 1e6
+
+
+def _run_frame(
+    job: Job,
+    frame: RgbdFrame,
+    methods: Sequence[str],
+    detector_for: DetectorFactory,
+    config: Config,
+    seeds: int,
+    tables: Tables,
+    warm_timings: list[Row] | None,
+    load: StageTime | None = None,
+    on_scene: Callable[[Job, Scene, tuple[TubeEstimate, ...]], None] | None = None,
+) -> None:
+    scene = prepare_scene(frame, job.rack, job.tubes, detector_for(job.rack, job.tubes), config, job.hint)
+    keys = {"session": job.session, "trial": job.trial, "capture": frame.capture, "frame": frame.index}
+    times = ([load] if load is not None else []) + list(scene.times)
+    first: tuple[TubeEstimate, ...] | None = None
+    for method in methods:
+        for seed in range(seeds) if method in STOCHASTIC else (None,):
+            estimates, tube_times = estimate_tubes(scene, method, config, seed)
+            times += tube_times
+            tables.estimates += [_estimate_row(keys, scene, estimate) for estimate in estimates]
+            if first is None:
+                first = estimates
+            if seed in (None, 0):
+                tables.racks.append({**keys, "method": method, **_rack_row(scene)})
+                tables.slots += _slot_rows(keys, method, scene, estimates)
+    timings = tables.timings if warm_timings is None else warm_timings
+    timings += [_timing_row(keys, entry, warm_timings is not None) for entry in times]
+    if on_scene is not None:
+        on_scene(job, scene, first or ())
+    if scene.rack_pose.status is RackStatus.UNIT and warm_timings is None:
+        raise CaptureError(scene.rack_pose.reason)
+
+
+def pose_columns(T: FloatArray | None) -> Row:
+    """A (4, 4) transform as the columns tx_m ... qz; NaN without one."""
+    if T is None:
+        return dict.fromkeys(POSE_COLUMNS, float("nan"))
+    return dict(zip(POSE_COLUMNS, (*(float(value) for value in T[:3, 3]), *quaternion_wxyz(T)), strict=True))
+
+
+def _rack_row(scene: Scene) -> Row:
+    pose = scene.rack_pose
+    return {
+        "timestamp_ns": scene.frame.timestamp_ns,
+        "rack": scene.rack.name,
+        "status": pose.status.value,
+        "reason": pose.reason,
+        "ambiguous": pose.ambiguous,
+        "resolved_by": pose.resolved_by,
+        "turn_margin_m": pose.turn_margin_m,
+        "inlier_rmse_m": pose.inlier_rmse_m,
+        "fitness": pose.fitness,
+        "in_slot_share": pose.in_slot_share,
+        "coverage": pose.coverage,
+        "spacing_m": pose.spacing_m,
+        "n_tubes_detected": sum(not detection.is_rack for detection in scene.detections),
+        **pose_columns(pose.T_camera_rack),
+    }
+
+
+def _slot_rows(keys: Row, method: str, scene: Scene, estimates: Sequence[TubeEstimate]) -> list[Row]:
+    if scene.rack_pose.T_camera_rack is None:
+        return []
+    held = {estimate.target.slot: estimate for estimate in estimates if estimate.target.slot is not None}
+    rows = []
+    for slot in scene.rack.all_slots:
+        estimate = held.get(slot.name)
+        row: Row = {**keys, "method": method, "slot": slot.name, "occupied": estimate is not None, "n_points": 0}
+        if estimate is not None:
+            target = estimate.target
+            row |= {
+                "tube": target.tube.name if target.tube is not None else None,
+                "share": target.share,
+                "n_points": len(target.points_m),
+                "status": estimate.pose.status.value,
+                "reason": estimate.pose.reason,
+            }
+        rows.append(row)
+    return rows
+
+
+def _estimate_row(keys: Row, scene: Scene, estimate: TubeEstimate) -> Row:
+    pose, target = estimate.pose, estimate.target
+    tilt_deg = float("nan")
+    if pose.T_rack_tube is not None:
+        tilt_deg = float(np.rad2deg(tilt_rad(pose.T_rack_tube[:3, 2], np.array([0.0, 0.0, 1.0]))))
+    return {
+        **keys,
+        "timestamp_ns": scene.frame.timestamp_ns,
+        "method": estimate.method,
+        "seed": estimate.seed,
+        "slot": target.slot,
+        "tube": target.tube.name if target.tube is not None else None,
+        "status": pose.status.value,
+        "reason": pose.reason,
+        "score": pose.score,
+        **pose_columns(estimate.T_camera_tube),
+        "tilt_deg": tilt_deg,
+        "inlier_rmse_m": pose.inlier_rmse_m,
+        "fitness": pose.fitness,
+        "n_points": pose.n_points,
+    }
+
+
+def _timing_row(keys: Row, entry: StageTime, warmup: bool) -> Row:
+    return {
+        **keys,
+        "method": entry.method,
+        "seed": entry.seed,
+        "stage": entry.stage,
+        "instance": entry.instance,
+        "duration_ms": entry.duration_ms,
+        "warmup": warmup,
+    }

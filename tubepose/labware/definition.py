@@ -1,0 +1,25 @@
+"""Labware as the definitions state it: racks with slots, tubes as profiles of revolution, printed caps.
+
+Definitions are written in millimetres, and every such field says so in its name; the methods and properties that
+the pipeline uses give metres. All models are frozen and strict: an unknown key is an error at every level.
+
+Frames. Rack: origin at the centre of the base, z up out of the slots, x along the columns (A1 to A2), y towards row A.
+Tube: origin at the outermost point of the bottom on the axis, z towards the opening. Cap: as the tube that wears it.
+"""
+
+from __future__ import annotations
+
+from functools import cached_property
+from typing import Annotated
+
+from pydantic import BaseModel, ConfigDict, Field
+
+MM = 1e-3
+Positive = Annotated[float, Field(gt=0)]
+NonNegative = Annotated[float, Field(ge=0)]
+
+
+class Definition(BaseModel):
+    """Base of every definition and of its parts: frozen, and strict about unknown keys."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, ignored_types=(cached_property,))

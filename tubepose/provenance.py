@@ -1,0 +1,103 @@
+"""What a run needs to be run again: versions, threads, configuration, and hashes of what went in."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import platform
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any
+
+import cv2
+import open3d as o3d
+from threadpoolctl import threadpool_limits
+
+from tubepose import __version__
+from tubepose.config import Config
+from tubepose.labware import CapModel, RackModel, TubeModel
+
+PACKAGES = ("numpy", "scipy", "open3d", "open3d-cpu", "onnxruntime", "opencv-python-headless", "pandas", "mcap")
+
+
+@contextmanager
+def pinned_threads(count: int = 1) -> Iterator[None]:
+    """Bound the threads of BLAS, OpenCV and Open3D: one thread makes sums, and so results, the same in every run."""
+    opencv_before, open3d_before = cv2.getNumThreads(), o3d.utility.get_max_threads()
+    cv2.setNumThreads(count)
+    o3d.utility.set_max_threads(count)
+    try:
+        with threadpool_limits(count):
+            yield
+    finally:
+        cv2.setNumThreads(opencv_before)
+        o3d.utility.set_max_threads(open3d_before)
+
+
+def sha256_of(path: Path) -> str:
+    """SHA-256 of a file; of a folder, of its files' relative names and contents in sorted order."""
+    digest = hashlib.sha256()
+    for file in [path] if path.is_file() else sorted(p for p in path.rglob("*") if p.is_file()):
+        if file != path:
+            digest.update(file.relative_to(path).as_posix().encode() + b"\0")
+        digest.update(hashlib.sha256(file.read_bytes()).digest())
+    return digest.hexdigest()
+
+
+def labware_sha256(item: RackModel | TubeModel | CapModel) -> str:
+    """SHA-256 of a definition's content, wherever it was read from."""
+    return hashlib.sha256(item.model_dump_json().encode()).hexdigest()
+
+
+def run_record(
+    command: Sequence[str],
+    config: Config,
+    labware: Sequence[RackModel | TubeModel | CapModel],
+    inputs: Sequence[Path],
+    **more: Any,
+) -> dict[str, Any]:
+    """Contents of `run.json`.
+
+    Args:
+        command: The command line.
+        config: The resolved configuration.
+        labware: Every definition that was used.
+        inputs: Captures, sessions and model files.
+        more: What else the command wants to keep (methods, seeds, threads, detector).
+    """
+    return {
+        "tubepose": __version__,
+        "command": list(command),
+        "config": config.model_dump(),
+        "versions": {"python": platform.python_version(), **_versions()},
+        "machine": machine(),
+        "labware_sha256": {item.name: labware_sha256(item) for item in labware},
+        "inputs_sha256": {str(path): sha256_of(path) for path in inputs},
+        **more,
+    }
+
+
+def machine() -> dict[str, Any]:
+    """System, processor and number of cores."""
+    return {"system": platform.platform(), "cpu": _cpu(), "cores": os.cpu_count()}
+
+
+def _versions() -> dict[str, str]:
+    found = {}
+    for name in PACKAGES:
+        try:
+            found[name] = version(name)
+        except PackageNotFoundError:
+            continue
+    return found
+
+
+def _cpu() -> str:
+    info = Path("/proc/cpuinfo")
+    if info.is_file():
+        for line in info.read_text(encoding="utf-8").splitlines():
+            if line.startswith("model name"):
+                return line.split(":", 1)[1].strip()
+    return platform.processor() or platform.machine()

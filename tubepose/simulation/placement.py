@@ -1,0 +1,160 @@
+"""Random placements that a real rack allows: tubes that lean in their slots, and a rack before the camera."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from tubepose.capture.frame import CameraIntrinsics
+from tubepose.errors import LabwareError
+from tubepose.labware import CapModel, RackModel, SlotModel, TubeModel
+from tubepose.simulation.collision import CLEARANCE_M, Solid, collide, solid_of
+from tubepose.simulation.scene import PlacedTube
+from tubepose.transforms import FloatArray, axis_rotation, make_transform, transform_points
+
+MAX_CAP_SPIN_RAD = np.deg2rad(5.0)
+MAX_SCANNER_TILT_RAD = np.deg2rad(20.0)
+DISTANCE_M = (0.60, 0.70)
+MAX_RACK_SHIFT_M = 0.06
+IMAGE_MARGIN = 0.04
+"""The rack keeps this share of the image's width away from its border."""
+CAP_ALBEDO = (0.35, 0.85)
+FILL = (0.10, 0.40)
+"""Share of the slots that hold a tube, when the caller does not choose."""
+
+_LEAN_TRIES = 200
+_NEIGHBOUR_TRIES = 30
+_POSE_TRIES = 500
+
+
+def place_tubes(
+    rack: RackModel, types: Sequence[TubeModel], count: int, cap: CapModel, rng: np.random.Generator
+) -> tuple[PlacedTube, ...]:
+    """Put up to `count` tubes of random types into random slots of a rack.
+
+    A tube whose cap, own or printed, would cut into a neighbour's is placed again; after a bounded number of tries its
+    slot stays empty and another slot is tried, so a rack with wide caps may hold fewer than `count`.
+
+    Raises:
+        LabwareError: A type fits into no slot, or is too short to wear the printed cap there.
+    """
+    for model in types:
+        if not any(_fits(rack, slot, model, cap) for slot in rack.all_slots):
+            raise LabwareError(
+                f"tube '{model.name}' cannot stand in rack '{rack.name}' and wear printed cap '{cap.name}' above its "
+                "top; choose a tube that is narrower than the slots and reaches out of them"
+            )
+    albedo = {model.name: float(rng.uniform(*CAP_ALBEDO)) for model in types}
+    placed: list[PlacedTube] = []
+    solids: list[Solid] = []
+    for i in rng.permutation(len(rack.all_slots)):
+        if len(placed) == count:
+            break
+        slot = rack.all_slots[i]
+        model = types[int(rng.integers(len(types)))]
+        if not _fits(rack, slot, model, cap):
+            continue
+        for _ in range(_NEIGHBOUR_TRIES):
+            spin = float(rng.uniform(-MAX_CAP_SPIN_RAD, MAX_CAP_SPIN_RAD))
+            tube = PlacedTube(slot.name, model, lean(rack, slot, model, rng), spin, albedo[model.name])
+            solid = solid_of(tube, cap)
+            if not any(collide(solid, other, cap) for other in solids):
+                placed.append(tube)
+                solids.append(solid)
+                break
+    order = {slot.name: k for k, slot in enumerate(rack.all_slots)}
+    return tuple(sorted(placed, key=lambda tube: order[tube.slot]))
+
+
+def _fits(rack: RackModel, slot: SlotModel, model: TubeModel, cap: CapModel) -> bool:
+    """Whether the tube goes into the slot, and its printed cap's plate stays above the rack."""
+    z, r = model.outer_profile_m().T
+    widest = float(r[z <= rack.depth_m].max())
+    room = -float(slot.signed_distance_m(slot.center_m))
+    plate_low = cap.offset_m(model) - cap.thickness_mm * 1e-3
+    return widest + CLEARANCE_M < room and plate_low > rack.depth_m + 1e-3
+
+
+def pivot_height_m(model: TubeModel) -> float:
+    """Height above the tube's origin of the point that the slot's floor holds: a round bottom's centre, or the tip."""
+    return model.body.bottom_height_mm * 1e-3 if model.body.bottom == "round" else 0.0
+
+
+def lean(rack: RackModel, slot: SlotModel, model: TubeModel, rng: np.random.Generator) -> FloatArray:
+    """Random T_rack_tube of shape (4, 4): the bottom within the floor's play, the body leaning as the slot allows.
+
+    The bottom's offset is uniform in the disc of `floor_play_mm`, the axis at the height of the rack's top is uniform
+    in what the opening leaves to the body's radius; pairs that would cut into the slot's wall are drawn again.
+    """
+    z, r = model.outer_profile_m().T
+    inside = z <= rack.depth_m
+    z, r = z[inside], r[inside]
+    pivot = pivot_height_m(model)
+    above = min(rack.depth_m, model.height_m)
+    room = np.maximum(slot.half_size_m - float(model.body_radius_m(above)) - CLEARANCE_M, 0.0)
+    for _ in range(_LEAN_TRIES):
+        low = _in_disc(rng, rack.floor_play_mm * 1e-3)
+        high = rng.uniform(-room, room)
+        slope = (high - low) / (above - pivot)
+        cos_tilt = 1 / np.sqrt(1 + slope @ slope)
+        centers = low + np.outer(z - pivot, slope)
+        if np.all(slot.signed_distance_m(centers + slot.center_m) <= -(r / cos_tilt + CLEARANCE_M)):
+            return _standing(rack, slot, model, low, slope)
+    return _standing(rack, slot, model, np.zeros(2), np.zeros(2))
+
+
+def _in_disc(rng: np.random.Generator, radius_m: float) -> FloatArray:
+    radius, angle = radius_m * np.sqrt(rng.uniform()), rng.uniform(0, 2 * np.pi)
+    return np.asarray(radius * np.array([np.cos(angle), np.sin(angle)]))
+
+
+def _standing(
+    rack: RackModel, slot: SlotModel, model: TubeModel, offset_m: FloatArray, slope: FloatArray
+) -> FloatArray:
+    """Pose of a tube whose lowest point touches the floor; `offset_m` (2,) is where its pivot stands off the centre."""
+    axis = np.array([*slope, 1.0]) / np.sqrt(1 + slope @ slope)
+    pivot = pivot_height_m(model)
+    if model.body.bottom == "round":
+        height = rack.floor_m + pivot
+    else:
+        tip_mm = model.body.cone_tip_diameter_mm if model.body.bottom == "conical" else model.body.bottom_diameter_mm
+        height = rack.floor_m + tip_mm * 0.5e-3 * float(np.hypot(axis[0], axis[1]))
+    return make_transform(axis_rotation(axis), np.array([*(slot.center_m + offset_m), height]) - pivot * axis)
+
+
+def place_rack(rack: RackModel, tallest_m: float, intrinsics: CameraIntrinsics, rng: np.random.Generator) -> FloatArray:
+    """Random T_camera_rack of shape (4, 4) with the whole rack and its tubes in view.
+
+    Any yaw; the camera's axis tilted 0 to 20 deg from the rack's normal about a random axis; the rack's top 0.60 to
+    0.70 m away and off the image's centre.
+
+    Args:
+        rack: The rack.
+        tallest_m: Height of the tallest tube's top above the rack's base.
+        intrinsics: Of the camera that must see all of it.
+        rng: Source of randomness.
+
+    Raises:
+        LabwareError: The rack is too large for the camera's view.
+    """
+    corners = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (0, tallest_m)])
+    corners[:, :2] *= rack.outline_m / 2
+    size = np.array([intrinsics.width, intrinsics.height])
+    facing = np.diag([1.0, -1.0, -1.0])
+    for _ in range(_POSE_TRIES):
+        yaw, about = rng.uniform(0, 2 * np.pi, 2)
+        tilt = rng.uniform(0, MAX_SCANNER_TILT_RAD)
+        shift = rng.uniform(-MAX_RACK_SHIFT_M, MAX_RACK_SHIFT_M, 2)
+        tilted = Rotation.from_rotvec(tilt * np.array([np.cos(about), np.sin(about), 0.0])).as_matrix()
+        rotation = tilted @ facing @ Rotation.from_euler("z", yaw).as_matrix()
+        top_center = np.array([*shift, rng.uniform(*DISTANCE_M)])
+        T_camera_rack = make_transform(rotation, top_center - rotation @ [0.0, 0.0, rack.height_m])
+        uv = intrinsics.project(transform_points(T_camera_rack, corners))
+        if np.all(uv > IMAGE_MARGIN * size) and np.all(uv < (1 - IMAGE_MARGIN) * size):
+            return T_camera_rack
+    raise LabwareError(
+        f"rack '{rack.name}' ({rack.outline_mm[0]:g} x {rack.outline_mm[1]:g} mm) does not fit into the view "
+        f"of the simulated camera at {DISTANCE_M[0]:g} to {DISTANCE_M[1]:g} m; choose a smaller rack"
+    )
