@@ -141,8 +141,9 @@ def level_noise_m(points_m: FloatArray, config: RackTopConfig) -> float:
         return float("nan")
     normal, origin = plane
     level = sample[np.abs((sample - origin) @ normal) < 3 * PATCH_RADIUS_M / 4]
-    patches: list[list[int]] = list(cKDTree(level).query_ball_point(thin(level, 100), PATCH_RADIUS_M))
-    rms = [_plane_rms(level[list(patch)]) for patch in patches if len(patch) >= 30]
+    near = cKDTree(level)
+    patches = [near.query_ball_point(center, PATCH_RADIUS_M) for center in thin(level, 100)]
+    rms = [_plane_rms(level[patch]) for patch in patches if len(patch) >= 30]
     return float(np.median(rms)) if rms else float("nan")
 
 

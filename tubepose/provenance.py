@@ -24,12 +24,16 @@ PACKAGES = ("numpy", "scipy", "open3d", "open3d-cpu", "onnxruntime", "opencv-pyt
 
 @contextmanager
 def pinned_threads(count: int = 1) -> Iterator[None]:
-    """Bound the threads of BLAS, OpenCV and Open3D: one thread makes sums, and so results, the same in every run."""
+    """Bound the threads of BLAS, OpenCV and Open3D (0: no bound): one thread makes sums, and so results, the same in every run.
+
+    Open3D's warnings, which it prints to stdout, are held back meanwhile: what they tell is checked where it is used.
+    """
     opencv_before, open3d_before = cv2.getNumThreads(), o3d.utility.get_max_threads()
     cv2.setNumThreads(count)
     o3d.utility.set_max_threads(count)
     try:
-        with threadpool_limits(count):
+        quiet = o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error)
+        with threadpool_limits(count or None), quiet:
             yield
     finally:
         cv2.setNumThreads(opencv_before)

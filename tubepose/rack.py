@@ -209,6 +209,9 @@ def _hypotheses(top: RackTop, band_m: FloatArray, rack: RackModel) -> list[Float
     box = to_o3d(band_m).get_minimal_oriented_bounding_box()
     up = top.T_camera_top[:3, 2]
     found = []
+    if not np.allclose(box.R.T @ box.R, np.eye(3), atol=1e-6):
+        # Open3D warns of such a box and returns it all the same.
+        box = to_o3d(band_m).get_oriented_bounding_box()
     for order in permutations(range(3)):
         sides_m = box.extent[list(order[:2])]
         if np.max(np.abs(sides_m - rack.outline_m) / rack.outline_m) > 0.25:
