@@ -20,7 +20,7 @@ from tubepose.config import Config
 from tubepose.detection import Detector
 from tubepose.errors import CaptureError, TubePoseError
 from tubepose.labware import RackModel, TubeModel
-from tubepose.pipeline import STOCHASTIC, Scene, StageTime, TubeEstimate, estimate_tubes, prepare_scene
+from tubepose.pipeline import DEFAULT_METHOD, STOCHASTIC, Scene, StageTime, TubeEstimate, estimate_tubes, prepare_scene
 from tubepose.rack import RackStatus
 from tubepose.transforms import FloatArray, quaternion_wxyz, tilt_rad
 
@@ -160,7 +160,7 @@ def run_jobs(
         seeds: Seeds of a stochastic method: 0, 1, ... (a deterministic method runs once).
         warm_up: Run the first frame once more before, with its timings marked.
         fail_fast: Raise the first problem instead of keeping it.
-        on_scene: Called with each frame's result (overlays).
+        on_scene: Called with each frame's result by one of the methods, ours if it is among them (overlays).
         on_done: Called after each job (progress).
     """
     tables = Tables()
@@ -211,21 +211,22 @@ def _run_frame(
     scene = prepare_scene(frame, job.rack, job.tubes, detector_for(job.rack, job.tubes), config, job.hint)
     keys = {"session": job.session, "trial": job.trial, "capture": frame.capture, "frame": frame.index}
     times = ([load] if load is not None else []) + list(scene.times)
-    first: tuple[TubeEstimate, ...] | None = None
+    shown_method = DEFAULT_METHOD if DEFAULT_METHOD in methods else methods[0]
+    shown: tuple[TubeEstimate, ...] = ()
     for method in methods:
         for seed in range(seeds) if method in STOCHASTIC else (None,):
             estimates, tube_times = estimate_tubes(scene, method, config, seed)
             times += tube_times
             tables.estimates += [_estimate_row(keys, scene, estimate) for estimate in estimates]
-            if first is None:
-                first = estimates
+            if method == shown_method and seed in (None, 0):
+                shown = estimates
             if seed in (None, 0):
                 tables.racks.append({**keys, "method": method, **_rack_row(scene)})
                 tables.slots += _slot_rows(keys, method, scene, estimates)
     timings = tables.timings if warm_timings is None else warm_timings
     timings += [_timing_row(keys, entry, warm_timings is not None) for entry in times]
     if on_scene is not None:
-        on_scene(job, scene, first or ())
+        on_scene(job, scene, shown)
     if scene.rack_pose.status is RackStatus.UNIT and warm_timings is None:
         raise CaptureError(scene.rack_pose.reason)
 

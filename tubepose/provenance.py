@@ -24,7 +24,7 @@ PACKAGES = ("numpy", "scipy", "open3d", "open3d-cpu", "onnxruntime", "opencv-pyt
 
 @contextmanager
 def pinned_threads(count: int = 1) -> Iterator[None]:
-    """Bound the threads of BLAS, OpenCV and Open3D (0: no bound): one thread makes sums, and so results, the same in every run.
+    """Bound the threads of BLAS, OpenCV and Open3D (0: no bound): one makes results the same in every run.
 
     Open3D's warnings, which it prints to stdout, are held back meanwhile: what they tell is checked where it is used.
     """

@@ -33,6 +33,7 @@ from tubepose.preprocessing import (
 from tubepose.transforms import FloatArray, invert_transform, make_transform, transform_points
 
 HALF_TURN = np.diag([-1.0, -1.0, 1.0, 1.0])
+MIN_POINTS = 50
 
 
 class RackStatus(StrEnum):
@@ -111,10 +112,13 @@ def register_rack(
         intrinsics: Of that image; without them the hint is not used.
     """
     pose = _register(points_m, rack, config, hint, intrinsics)
-    if pose.status in (RackStatus.NOT_FOUND, RackStatus.REFUSED):
-        reason = _unit_suspicion(points_m, rack, config)
-        if reason:
-            return replace(pose, status=RackStatus.UNIT, reason=reason)
+    if pose.status is RackStatus.OK or len(points_m) < MIN_POINTS:
+        return pose
+    # Asked of a too coarse scan as well: millimetres read as metres are one.
+    reason = _unit_suspicion(points_m, rack, config)
+    if reason:
+        return replace(pose, status=RackStatus.UNIT, reason=reason)
+    if pose.status is not RackStatus.INSUFFICIENT:
         noise_m = level_noise_m(points_m, config.rack_top)
         if noise_m > config.rack.max_inlier_rmse_m:
             return replace(pose, status=RackStatus.INSUFFICIENT, reason=_too_noisy(noise_m, pose.reason, config.rack))
@@ -124,8 +128,9 @@ def register_rack(
 def _register(
     points_m: FloatArray, rack: RackModel, config: Config, hint: SlotHint | None, intrinsics: CameraIntrinsics | None
 ) -> RackPose:
-    if len(points_m) < 50:
-        return RackPose(RackStatus.INSUFFICIENT, f"{len(points_m)} valid points on the rack, expected at least 50")
+    if len(points_m) < MIN_POINTS:
+        reason = f"{len(points_m)} valid points on the rack, expected at least {MIN_POINTS}"
+        return RackPose(RackStatus.INSUFFICIENT, reason)
     top = find_rack_top(points_m, rack, config.rack_top)
     if top is None or not top.fits(config.rack_top):
         return _not_found(points_m, top, rack, config.rack)

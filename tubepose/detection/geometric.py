@@ -76,10 +76,7 @@ class GeometricDetector:
         explained = np.zeros(len(xy), bool)
         if len(found):
             explained = np.asarray(cKDTree(found).query(xy)[0]) < 1.5 * radius_m
-        nearest_m, slot = (np.asarray(values) for values in cKDTree(centers_m).query(xy))
-        loose = ~explained & (nearest_m < 0.35 * pitch_m)
-        counts = np.bincount(slot[loose], minlength=len(centers_m))
-        unknown = counts >= 2 * self.config.preprocess.min_tube_points
+        unknown = _filled_slots(xy[~explained], centers_m, 0.35 * pitch_m, 2 * self.config.preprocess.min_tube_points)
         middles = np.vstack([found, centers_m[unknown]])
         if len(middles) == 0:
             return np.full(len(xy), -1)
@@ -95,6 +92,24 @@ class GeometricDetector:
             v, u = np.divmod(box_rows, frame.cloud_m.shape[1])
             box = (float(u.min()), float(v.min()), float(u.max()), float(v.max()))
         return Detection(class_name, score, box, "geometric", rows)
+
+
+def _filled_slots(xy_m: FloatArray, centers_m: FloatArray, radius_m: float, min_points: int) -> list[int]:
+    """Slots whose middle is covered by points (N, 2): something stands there.
+
+    Light that went through a neighbour's wall leaves points too, but in a corner of the slot: their hull is small.
+    """
+    filled: list[int] = []
+    if len(xy_m) == 0:
+        return filled
+    tree = cKDTree(xy_m)
+    for slot, center in enumerate(centers_m):
+        near = tree.query_ball_point(center, radius_m)
+        if len(near) >= min_points:
+            hull = cv2.convexHull((xy_m[near] * 1e3).astype(np.float32))
+            if cv2.contourArea(hull) * 1e-6 > 0.5 * np.pi * radius_m**2:
+                filled.append(slot)
+    return filled
 
 
 def _nearest_pitch(centers_m: FloatArray) -> FloatArray:

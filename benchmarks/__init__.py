@@ -1,0 +1,1 @@
+"""Commands that produce the numbers of benchmarks/README.md, on the public API alone."""

@@ -1,0 +1,65 @@
+"""Configuration: defaults, changes from a file, refusals."""
+
+import pytest
+from pydantic import ValidationError
+
+from tubepose.config import Config, TubeConfig, load_config
+from tubepose.errors import ConfigError
+
+
+def written(tmp_path, text):
+    path = tmp_path / "config.yaml"
+    path.write_text(text, encoding="utf-8")
+    return path
+
+
+def test_no_file_gives_the_defaults():
+    assert load_config(None) == Config()
+
+
+def test_a_file_changes_what_it_names_and_nothing_else(tmp_path):
+    config = load_config(written(tmp_path, "tube:\n  objective: l2\nrack:\n  icp_distances_m: [0.004, 0.001]\n"))
+    assert config.tube == TubeConfig(objective="l2")
+    assert config.rack.icp_distances_m == (0.004, 0.001)
+    assert config.rack.min_fitness == Config().rack.min_fitness
+    assert config.slots == Config().slots
+
+
+def test_unknown_section_names_the_known_ones(tmp_path):
+    with pytest.raises(ConfigError, match=r"unknown key 'tubes'; known keys: .*rack_top, rack, slots, tube, icp"):
+        load_config(written(tmp_path, "tubes: {}\n"))
+
+
+def test_unknown_key_inside_a_section_names_the_keys_of_that_section(tmp_path):
+    path = written(tmp_path, "slots:\n  min_shares: 0.3\n")
+    with pytest.raises(ConfigError, match=r"unknown key 'slots\.min_shares'; known keys: .*min_share, height") as error:
+        load_config(path)
+    assert "objective" not in str(error.value)
+    assert str(path) in str(error.value)
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("tube:\n  min_points: many\n", r"tube\.min_points: .*integer.*'many'"),
+        ("tube:\n  objective: median\n", r"tube\.objective: .*'hinge', 'signed', 'l1', 'l2' or 'count'.*'median'"),
+        ("rack: 3\n", r"rack: .*found 3"),
+        ("- a\n", "expected a mapping"),
+        ("tube: [\n", "not valid YAML"),
+    ],
+)
+def test_wrong_values_are_named_in_one_line(tmp_path, text, message):
+    with pytest.raises(ConfigError, match=message) as error:
+        load_config(written(tmp_path, text))
+    assert "\n" not in str(error.value)
+
+
+def test_missing_file(tmp_path):
+    with pytest.raises(ConfigError, match=r"none\.yaml: no such file"):
+        load_config(tmp_path / "none.yaml")
+
+
+def test_a_section_cannot_be_changed_in_place():
+    with pytest.raises(ValidationError, match="frozen"):
+        Config().tube.min_points = 1

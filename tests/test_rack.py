@@ -1,0 +1,271 @@
+"""Registration of the rack: recovery, what tells racks and turns apart, and every refusal."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+import scenes
+from scipy.spatial.transform import Rotation
+
+from tubepose.capture.session import SlotHint
+from tubepose.config import Config, RackConfig
+from tubepose.labware import load_rack, load_tube
+from tubepose.rack import HALF_TURN, RackStatus, rack_template_m, register_rack
+from tubepose.transforms import invert_transform, make_transform, transform_points
+
+CONFIG = Config()
+SOFT = load_rack("chen2023-soft-5x10")
+HARD = load_rack("chen2023-hard-5x10")
+MIXED = load_rack("mixed-6x15ml-4x50ml")
+T_CAMERA_SOFT = scenes.camera_from_rack(SOFT, yaw_rad=0.3, tilt_rad=0.2)
+
+
+@pytest.fixture(scope="module")
+def soft_scan():
+    return transform_points(T_CAMERA_SOFT, scenes.rack_top(SOFT))
+
+
+def assert_same_pose(T_found, T_true, angle_deg=0.1, distance_m=1.5e-4):
+    """Within 0.1 degrees and 0.15 mm: a fifth of the scan's spacing."""
+    assert scenes.angle_deg(T_found[:3, :3], T_true[:3, :3]) < angle_deg
+    assert np.linalg.norm((T_found - T_true)[:3, 3]) < distance_m
+
+
+def turned_to_match(T_camera_rack, T_true):
+    """The same pose, or its half turn if that is nearer: for what geometry cannot tell."""
+    return min((T_camera_rack, T_camera_rack @ HALF_TURN), key=lambda T: scenes.angle_deg(T[:3, :3], T_true[:3, :3]))
+
+
+@pytest.mark.parametrize(
+    "name", ["chen2023-soft-5x10", "chen2023-hard-5x10", "steel-round-16mm-5x10", "round-10ml-3x4", "quincunx-17mm-8"]
+)
+def test_any_yaw_and_tilts_to_25_degrees_are_recovered(name):
+    rack = load_rack(name)
+    rng = np.random.default_rng(sum(name.encode()))
+    for seed, tilt in enumerate(np.deg2rad([25.0, rng.uniform(0, 25)])):
+        T_true = scenes.camera_from_rack(rack, rng.uniform(0, 2 * np.pi), tilt, rng.uniform(0.5, 0.7))
+        pose = register_rack(transform_points(T_true, scenes.rack_top(rack, seed)), rack, CONFIG)
+        assert pose.status is RackStatus.OK
+        assert_same_pose(turned_to_match(pose.T_camera_rack, T_true), T_true)
+        assert (pose.ambiguous, pose.resolved_by) == (True, "rule")
+        assert abs(pose.turn_margin_m) < CONFIG.rack.ambiguous_margin_m
+        assert pose.fitness > 0.99
+        assert pose.in_slot_share < 0.01
+        assert pose.coverage > 0.9
+
+
+@pytest.mark.parametrize("yaw_deg", [0, 100, 200, 300])
+def test_an_irregular_rack_is_told_from_its_half_turn_by_geometry(yaw_deg):
+    T_true = scenes.camera_from_rack(MIXED, np.deg2rad(yaw_deg), 0.2)
+    pose = register_rack(transform_points(T_true, scenes.rack_top(MIXED)), MIXED, CONFIG)
+    assert (pose.status, pose.ambiguous, pose.resolved_by) == (RackStatus.OK, False, "geometry")
+    assert pose.turn_margin_m > CONFIG.rack.ambiguous_margin_m
+    assert_same_pose(pose.T_camera_rack, T_true)
+
+
+def test_geometry_outweighs_a_wrong_hint():
+    T_true = scenes.camera_from_rack(MIXED, 0.4)
+    wrong = scenes.CAMERA.project(
+        transform_points(T_true @ HALF_TURN, np.array([*MIXED.slot("A1").center_m, MIXED.height_m]))
+    )
+    points = transform_points(T_true, scenes.rack_top(MIXED))
+    pose = register_rack(points, MIXED, CONFIG, SlotHint(slot="A1", pixel=tuple(wrong)), scenes.CAMERA)
+    assert pose.resolved_by == "geometry"
+    assert_same_pose(pose.T_camera_rack, T_true)
+
+
+@pytest.mark.parametrize("turn", [np.eye(4), HALF_TURN], ids=["as-it-is", "half-turn"])
+def test_a_hint_decides_for_either_turn(soft_scan, turn):
+    T_true = T_CAMERA_SOFT @ turn
+    place = transform_points(T_true, np.array([*SOFT.slot("B2").center_m, SOFT.height_m]))
+    u, v = scenes.CAMERA.project(place)
+    pose = register_rack(soft_scan, SOFT, CONFIG, SlotHint(slot="B2", pixel=(u + 5, v - 5)), scenes.CAMERA)
+    assert (pose.ambiguous, pose.resolved_by) == (False, "hint")
+    assert_same_pose(pose.T_camera_rack, T_true)
+
+
+def test_a_hint_halfway_between_the_turns_decides_nothing(soft_scan):
+    middle = scenes.CAMERA.project(T_CAMERA_SOFT[:3, 3] + SOFT.height_m * T_CAMERA_SOFT[:3, 2])
+    hint = SlotHint(slot="A1", pixel=tuple(middle))
+    pose = register_rack(soft_scan, SOFT, CONFIG, hint, scenes.CAMERA)
+    assert (pose.ambiguous, pose.resolved_by) == (True, "rule")
+
+
+def test_a_hint_without_intrinsics_is_not_used(soft_scan):
+    pose = register_rack(soft_scan, SOFT, CONFIG, SlotHint(slot="A1", pixel=(0.0, 0.0)), None)
+    assert (pose.ambiguous, pose.resolved_by) == (True, "rule")
+
+
+@pytest.mark.parametrize("yaw_deg", [10, 100, 190, 280])
+def test_the_rule_lets_the_racks_x_point_to_the_bottom_right(yaw_deg):
+    T_true = scenes.camera_from_rack(SOFT, np.deg2rad(yaw_deg))
+    pose = register_rack(transform_points(T_true, scenes.rack_top(SOFT)), SOFT, CONFIG)
+    assert pose.T_camera_rack[:2, 0].sum() > 0
+    assert_same_pose(turned_to_match(pose.T_camera_rack, T_true), T_true)
+
+
+def test_half_of_the_top_hidden_under_tubes():
+    tube = load_tube("chen2023-tube-3")
+    top = scenes.rack_top(SOFT)
+    held = [slot for i, slot in enumerate(SOFT.all_slots) if slot.center_mm[0] < 0 or i % 2]
+    for slot in held:
+        top = top[np.hypot(*(top[:, :2] - slot.center_m).T) > 13e-3]
+    assert len(top) < 0.5 * len(scenes.rack_top(SOFT))
+    tubes = [
+        scenes.tube_surface(tube, scenes.tube_pose(SOFT, slot.name), SOFT.height_m, spacing_m=1.2e-3) for slot in held
+    ]
+    pose = register_rack(transform_points(T_CAMERA_SOFT, np.vstack([top, *tubes])), SOFT, CONFIG)
+    assert pose.status is RackStatus.OK
+    assert_same_pose(turned_to_match(pose.T_camera_rack, T_CAMERA_SOFT), T_CAMERA_SOFT)
+
+
+def test_tubes_slot_floors_and_the_table_do_not_move_the_rack(soft_scan):
+    tube = load_tube("chen2023-tube-1")
+    table = np.random.default_rng(0).uniform([-0.2, -0.2, 0], [0.2, 0.2, 0], (8000, 3))
+    others = [
+        *(scenes.tube_surface(tube, scenes.tube_pose(SOFT, name), SOFT.height_m) for name in ("A1", "C5", "E9")),
+        scenes.slot_floors(SOFT),
+        table,
+    ]
+    crowded = np.vstack([soft_scan, transform_points(T_CAMERA_SOFT, np.vstack(others))])
+    pose = register_rack(crowded, SOFT, CONFIG)
+    assert pose.status is RackStatus.OK
+    assert_same_pose(turned_to_match(pose.T_camera_rack, T_CAMERA_SOFT), T_CAMERA_SOFT)
+
+
+def test_moving_the_camera_moves_the_pose_with_it():
+    T_true = scenes.camera_from_rack(MIXED, 0.5, 0.1)
+    points = transform_points(T_true, scenes.rack_top(MIXED))
+    T_moved_camera = make_transform(
+        Rotation.from_euler("zyx", [40, 8, -6], degrees=True).as_matrix(), np.array([0.03, -0.02, 0.05])
+    )
+    before = register_rack(points, MIXED, CONFIG).T_camera_rack
+    after = register_rack(transform_points(T_moved_camera, points), MIXED, CONFIG).T_camera_rack
+    assert_same_pose(invert_transform(T_moved_camera) @ after, before)
+
+
+def test_the_order_of_the_points_does_not_matter(soft_scan):
+    before = register_rack(soft_scan, SOFT, CONFIG).T_camera_rack
+    after = register_rack(soft_scan[::-1], SOFT, CONFIG).T_camera_rack
+    assert_same_pose(after, before, angle_deg=0.05, distance_m=5e-5)
+
+
+def test_the_same_points_give_the_same_bits(soft_scan):
+    first, second = (register_rack(soft_scan, SOFT, CONFIG).T_camera_rack for _ in range(2))
+    assert np.array_equal(first, second)
+
+
+@pytest.mark.parametrize(("true", "asked"), [(SOFT, HARD), (HARD, SOFT)], ids=["soft-as-hard", "hard-as-soft"])
+def test_a_rack_of_another_pitch_is_refused_by_the_points_in_its_openings(true, asked):
+    T_true = scenes.camera_from_rack(true, 0.3, 0.2)
+    pose = register_rack(transform_points(T_true, scenes.rack_top(true)), asked, CONFIG)
+    assert pose.status is RackStatus.REFUSED
+    assert pose.T_camera_rack is None
+    assert pose.resolved_by == ""
+    assert pose.fitness > CONFIG.rack.min_fitness  # fitness alone would have accepted it
+    assert f"lie inside the openings of {asked.name}" in pose.reason
+
+
+def test_a_rack_of_another_size_is_not_found(soft_scan):
+    pose = register_rack(soft_scan, load_rack("round-10ml-3x4"), CONFIG)
+    assert pose.status is RackStatus.NOT_FOUND
+    assert "no top of round-10ml-3x4 (130 x 90 mm)" in pose.reason
+    assert pose.T_camera_rack is None
+
+
+def test_half_a_rack_is_not_found_and_the_reason_tells_its_size():
+    top = scenes.rack_top(SOFT)
+    pose = register_rack(transform_points(T_CAMERA_SOFT, top[top[:, 0] > 0]), SOFT, CONFIG)
+    assert pose.status is RackStatus.NOT_FOUND
+    assert "closest: a band of 96." in pose.reason
+
+
+@pytest.mark.parametrize(
+    ("rack", "factor", "words"),
+    [
+        (SOFT, 1000.0, "1000 times larger"),
+        (MIXED, 0.001, "1000 times smaller"),
+        (MIXED, 10.0, "10 times larger"),
+        (SOFT, 0.1, "10 times smaller"),
+    ],
+    ids=["x1000", "/1000", "x10", "/10"],
+)
+def test_a_wrong_unit_is_the_suspect_and_names_the_factor(rack, factor, words):
+    points = transform_points(scenes.camera_from_rack(rack, 0.3, 0.2), scenes.rack_top(rack))
+    pose = register_rack(points * factor, rack, CONFIG)
+    assert pose.status is RackStatus.UNIT
+    assert pose.T_camera_rack is None
+    assert words in pose.reason
+    assert "unit" in pose.reason
+
+
+def test_a_wrong_unit_is_not_suspected_of_another_rack(soft_scan):
+    pose = register_rack(soft_scan * 1000, load_rack("round-10ml-3x4"), CONFIG)
+    assert pose.status is not RackStatus.UNIT
+    assert pose.T_camera_rack is None
+
+
+@pytest.mark.parametrize("count", [0, 1, 49])
+def test_too_few_points(soft_scan, count):
+    pose = register_rack(soft_scan[:count], SOFT, CONFIG)
+    assert pose.status is RackStatus.INSUFFICIENT
+    assert pose.reason == f"{count} valid points on the rack, expected at least 50"
+
+
+def test_a_scan_coarser_than_the_ribs_is_insufficient():
+    scan = scenes.rack_top(SOFT, spacing_m=2.2e-3)
+    pose = register_rack(transform_points(T_CAMERA_SOFT, scan), SOFT, CONFIG)
+    assert pose.status is RackStatus.INSUFFICIENT
+    assert "mm apart, and the ribs of chen2023-soft-5x10 are 1.20 mm wide" in pose.reason
+    assert pose.spacing_m > SOFT.min_rib_m
+    assert pose.T_camera_rack is None
+
+
+def test_noisy_depth_is_insufficient(soft_scan):
+    along = soft_scan / np.linalg.norm(soft_scan, axis=1, keepdims=True)
+    noisy = soft_scan + along * np.random.default_rng(0).normal(0, 3e-3, (len(soft_scan), 1))
+    pose = register_rack(noisy, SOFT, CONFIG)
+    assert pose.status is RackStatus.INSUFFICIENT
+    assert "depth scatters by" in pose.reason
+    assert "at most 1.1 mm" in pose.reason
+    assert pose.T_camera_rack is None
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"min_coverage": 0.999}, "of the top seen, at least 100% expected"),
+        ({"min_fitness": 1.01}, "fitness 1.000, at least 1.01 expected"),
+        ({"max_inlier_rmse_m": 1.5e-4}, "inlier rmse 0.2"),
+    ],
+    ids=["coverage", "fitness", "rmse"],
+)
+def test_every_threshold_can_refuse_in_words(soft_scan, change, words):
+    config = CONFIG.model_copy(update={"rack": RackConfig(**change)})
+    pose = register_rack(soft_scan, SOFT, config)
+    assert pose.status is RackStatus.REFUSED
+    assert words in pose.reason
+    assert pose.T_camera_rack is None
+
+
+def test_points_that_correspond_to_nothing_give_no_pose(soft_scan):
+    config = CONFIG.model_copy(update={"rack": RackConfig(icp_distances_m=(1e-9,), judge_distance_m=1e-9)})
+    pose = register_rack(soft_scan, SOFT, config)
+    assert pose.status is RackStatus.REFUSED
+    assert "fitness 0.000" in pose.reason
+    assert pose.T_camera_rack is None
+
+
+def test_a_failed_pose_has_no_numbers_that_look_like_one():
+    pose = register_rack(np.empty((0, 3)), SOFT, CONFIG)
+    numbers = [value for value in dataclasses.asdict(pose).values() if isinstance(value, float)]
+    assert len(numbers) == 6
+    assert np.isnan(numbers).all()
+
+
+def test_the_template_lies_on_the_solid_top_and_nowhere_else():
+    template = rack_template_m(MIXED, 1e-3)
+    assert np.all(template[:, 2] == MIXED.height_m)
+    solid = np.prod(MIXED.outline_mm) - sum(np.pi * (s.size_mm[0] / 2) ** 2 for s in MIXED.all_slots)
+    assert len(template) == pytest.approx(solid, rel=0.01)  # one point per square millimetre
+    assert not np.any(np.hypot(*(template[:, :2] - MIXED.slot("B4").center_m).T) < 15e-3)
