@@ -34,6 +34,9 @@ def bench(
     layout: Annotated[str | None, typer.Option(help="Output layout of the model, where it cannot be told.")] = None,
     config: Annotated[Path | None, typer.Option(help="YAML file that changes defaults (docs/method.md).")] = None,
     overlays: Annotated[bool, typer.Option(help="Write one overlay picture per frame.")] = False,
+    known_rack: Annotated[
+        bool, typer.Option("--known-rack", help="Take the rack's pose from the exact truth (simulated sessions only).")
+    ] = False,
     published: Annotated[bool, typer.Option("--published", help="Add the paper's own figures to the tables.")] = False,
     fail_fast: Annotated[bool, typer.Option("--fail-fast", help="Stop at the first bad capture.")] = False,
 ) -> None:
@@ -45,6 +48,7 @@ def bench(
     from tubepose.batch import session_jobs
     from tubepose.config import load_config
     from tubepose.errors import TubePoseError
+    from tubepose.truth_tables import with_exact_rack
     from tubepose_cli.inputs import find_sessions, make_detector, read_methods, sample_session
     from tubepose_cli.results import run_estimates
     from tubepose_cli.show import finish
@@ -66,7 +70,7 @@ def bench(
     measured = measure_sessions(folders, out, fail_fast=fail_fast)
     for session in measured.sessions:
         found, unread = session_jobs(session)
-        jobs += found
+        jobs += with_exact_rack(found, session) if known_rack else found
         problems += unread
     tables = run_estimates(
         jobs, names, detector_for, settings, out, sys.argv, seeds=seeds, overlays=overlays, fail_fast=fail_fast,
@@ -83,8 +87,8 @@ def _report(
     seeds: int, published: bool,
 ) -> None:  # fmt: skip
     """Evaluate, write and print."""
-    from tubepose.batch import ESTIMATE_COLUMNS, TIMING_COLUMNS, to_table
-    from tubepose.evaluation import compare, evaluate, seed_spread, summarise
+    from tubepose.batch import ESTIMATE_COLUMNS, SLOT_COLUMNS, TIMING_COLUMNS, to_table
+    from tubepose.evaluation import compare, evaluate, seed_spread, slot_accuracy, summarise
     from tubepose.pipeline import STOCHASTIC
     from tubepose.report.tables import accuracy_table, timing_table
     from tubepose.report.writing import write_csv, write_table
@@ -99,7 +103,9 @@ def _report(
     reference = "paper" if "paper" in methods else methods[0]
     write_csv(out / "comparison.csv", compare(errors, reference))
     write_csv(out / "seeds.csv", seed_spread(errors))
-    notes = [_data_note(measured, jobs), *measured.notes, *_rack_notes(tables)]
+    slots = slot_accuracy(to_table(tables.slots, SLOT_COLUMNS), measured.truth)
+    write_csv(out / "slot_accuracy.csv", slots)
+    notes = [_data_note(measured, jobs), *measured.notes, *_rack_notes(tables), _slot_note(slots)]
     if any(method in STOCHASTIC for method in methods):
         notes += [*_rival_notes(config, seeds), *_spread_notes(seed_spread(errors))]
     accuracy = accuracy_table(summary, notes, published)
@@ -115,7 +121,8 @@ def _data_note(measured: MeasuredTruth, jobs: Sequence[Job]) -> str:
     sensors = sorted({session.sensor for session in measured.sessions})
     racks = sorted({job.rack.name for job in jobs})
     kind = "SIMULATED data, no real scan" if kinds == ["simulated"] else " and ".join(kinds) + " data"
-    seen = f"sensor {', '.join(sensors)}; rack {', '.join(racks)}, its pose estimated, not given"
+    given = "its pose given" if any(job.T_camera_rack is not None for job in jobs) else "its pose estimated, not given"
+    seen = f"sensor {', '.join(sensors)}; rack {', '.join(racks)}, {given}"
     return f"{kind}: {len(jobs)} captures; {seen}."
 
 
@@ -123,6 +130,16 @@ def _rack_notes(tables: Tables) -> list[str]:
     frames = {(row["session"], row["capture"], row["frame"]): row["status"] for row in tables.racks}
     ok = sum(status == "ok" for status in frames.values())
     return [f"Racks: {ok} of {len(frames)} frames with an accepted pose."]
+
+
+def _slot_note(slots: pd.DataFrame) -> str:
+    first = slots.iloc[0] if len(slots) else None
+    if first is None:
+        return "Slots: none judged."
+    return (
+        f"Slots (all methods share them): {first['n_found']} of {first['n_occupied']} occupied ones found, "
+        f"{first['n_left_empty']} of {first['n_empty']} empty ones left empty."
+    )
 
 
 def _rival_notes(config: Config, seeds: int) -> list[str]:

@@ -29,7 +29,7 @@ DetectorFactory = Callable[[RackModel, tuple[TubeModel, ...]], Detector]
 POSE_COLUMNS = ("tx_m", "ty_m", "tz_m", "qw", "qx", "qy", "qz")
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class Job:
     """One capture and what is known about it.
 
@@ -40,6 +40,7 @@ class Job:
         hint: Which way round the rack stands, if known.
         session: Name of its session, or empty.
         trial: Name of its trial, or empty.
+        T_camera_rack: The rack's pose where it is known and not to be estimated, shape (4, 4), metres; else None.
     """
 
     capture: Capture
@@ -48,6 +49,7 @@ class Job:
     hint: SlotHint | None = None
     session: str = ""
     trial: str = ""
+    T_camera_rack: FloatArray | None = None
 
 
 @dataclass(slots=True)
@@ -208,7 +210,9 @@ def _run_frame(
     load: StageTime | None = None,
     on_scene: Callable[[Job, Scene, tuple[TubeEstimate, ...]], None] | None = None,
 ) -> None:
-    scene = prepare_scene(frame, job.rack, job.tubes, detector_for(job.rack, job.tubes), config, job.hint)
+    scene = prepare_scene(
+        frame, job.rack, job.tubes, detector_for(job.rack, job.tubes), config, job.hint, job.T_camera_rack
+    )
     keys = {"session": job.session, "trial": job.trial, "capture": frame.capture, "frame": frame.index}
     times = ([load] if load is not None else []) + list(scene.times)
     shown_method = DEFAULT_METHOD if DEFAULT_METHOD in methods else methods[0]

@@ -257,6 +257,35 @@ def compare(errors: pd.DataFrame, reference_method: str, draws: int = DRAWS, see
     return pd.DataFrame(rows, columns=list(COMPARISON_COLUMNS))
 
 
+def slot_accuracy(slots: pd.DataFrame, declared: pd.DataFrame) -> pd.DataFrame:
+    """How many occupied slots were found occupied, and how many empty ones were left empty.
+
+    Args:
+        slots: Rows of slots.csv.
+        declared: One row per session, trial and occupied slot: ground_truth.csv, refused rows too.
+
+    Returns:
+        Rows of slot_accuracy.csv: method, n_occupied, n_found, n_empty, n_left_empty. Trials without declared tubes
+        and frames without a rack's pose are left out.
+    """
+    trials = declared[_TRIAL].drop_duplicates()
+    judged = slots.merge(trials, on=_TRIAL).merge(
+        declared[[*_TRIAL, "slot"]].assign(declared=True), how="left", on=[*_TRIAL, "slot"]
+    )
+    holds = judged["declared"].notna()
+    found = judged["occupied"].astype(bool)
+    counts = pd.DataFrame(
+        {
+            "method": judged["method"],
+            "n_occupied": holds,
+            "n_found": holds & found,
+            "n_empty": ~holds,
+            "n_left_empty": ~holds & ~found,
+        }
+    )
+    return counts.groupby("method", sort=False).sum().astype(int).reset_index()
+
+
 def seed_spread(errors: pd.DataFrame) -> pd.DataFrame:
     """Smallest and largest result over the seeds of every stochastic method, per tube.
 

@@ -130,6 +130,7 @@ def prepare_scene(
     detector: Detector,
     config: Config,
     hint: SlotHint | None = None,
+    T_camera_rack: FloatArray | None = None,
 ) -> Scene:
     """Detect, register the rack, and find the slot and the type of every tube.
 
@@ -140,6 +141,7 @@ def prepare_scene(
         detector: Source of boxes.
         config: All sections.
         hint: Which way round the rack stands, if known.
+        T_camera_rack: The rack's pose where it is known; its registration is then left out.
     """
     clock = _Clock()
     intrinsics = frame.intrinsics
@@ -147,8 +149,11 @@ def prepare_scene(
         intrinsics = estimate_intrinsics(frame.cloud_m)
     with clock.stage("detect"):
         detections = detector.detect(frame)
-    with clock.stage("rack"):
-        rack_pose = _rack_pose(frame, rack, detections, config, hint, intrinsics)
+    if T_camera_rack is not None:
+        rack_pose = RackPose(RackStatus.OK, T_camera_rack=T_camera_rack, resolved_by="given")
+    else:
+        with clock.stage("rack"):
+            rack_pose = _rack_pose(frame, rack, detections, config, hint, intrinsics)
     targets: tuple[TubeTarget, ...] = ()
     if rack_pose.T_camera_rack is not None:
         with clock.stage("slots"):

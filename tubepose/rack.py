@@ -59,8 +59,8 @@ class RackPose:
         in_slot_share: Share of the top's points that lie inside the template's openings; NaN without a registration.
         coverage: Share of the template that the scan covers; NaN without a registration.
         ambiguous: True when neither geometry nor a hint tells the rack from itself turned by 180 degrees.
-        resolved_by: ``geometry``, ``hint``, or ``rule`` (rack x points to the bottom right of the image); empty
-            without a pose.
+        resolved_by: ``geometry``, ``hint``, or ``rule`` (rack x points to the bottom right of the image), or ``given``;
+            empty without a pose.
         turn_margin_m: Inlier rmse of the other turn minus that of this one, metres; NaN without a registration.
         spacing_m: Median point spacing of the top, metres; NaN without points.
     """

@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 import pandas as pd
 
-from tubepose.batch import POSE_COLUMNS, Row, pose_columns, trial_capture
+from tubepose.batch import POSE_COLUMNS, Job, Row, pose_columns, trial_capture
 from tubepose.capture.session import Session, Trial
-from tubepose.errors import CaptureError, TubePoseError
+from tubepose.errors import CaptureError, ConfigError, TubePoseError
 from tubepose.ground_truth import GroundTruthConfig, GroundTruthResult, measure_ground_truth
 from tubepose.pose_errors import pose_errors
 from tubepose.simulation import read_exact_truth
@@ -125,6 +125,17 @@ def _floor_rows(keys: Row, session: Session, trial: Trial, result: GroundTruthRe
 def _errors(T_truth: FloatArray, T_measured: FloatArray, height_m: float) -> Row:
     found = pose_errors(T_truth[None], T_measured[None], np.array([height_m]))
     return {name: float(getattr(found, name)[0]) for name in FLOOR_COLUMNS[4:]}
+
+
+def with_exact_rack(jobs: Sequence[Job], session: Session) -> list[Job]:
+    """The jobs of a simulated session with the rack's exact pose, to tell the rack's error from the tubes'.
+
+    Raises:
+        ConfigError: The session is recorded, or its exact truth is not there.
+    """
+    if session.origin != "simulated":
+        raise ConfigError(f"session {session.name} is recorded: only simulated ones know the rack's exact pose")
+    return [replace(job, T_camera_rack=read_exact_truth(session.folder, job.trial).T_camera_rack) for job in jobs]
 
 
 def floor_note(floor: pd.DataFrame) -> str:
