@@ -51,8 +51,8 @@ def tube_surface(
 ) -> FloatArray:
     """Points on the outside of a tube that are higher than `above_m`, rack frame, in random order.
 
-    The profile is turned about the axis with the same number of points per area everywhere. With `seen_from`, a
-    direction in the rack frame, only the side whose normals point that way is kept.
+    The profile is turned about the axis with the same number of points per area everywhere. With `seen_from`, a unit
+    direction in the rack frame, points thin out with the cosine of incidence and the far side has none, as pixels do.
     """
     rng = np.random.default_rng(seed)
     profile = tube.outer_profile_m()
@@ -73,8 +73,13 @@ def tube_surface(
     if seen_from is not None:
         n_r, n_z = (z1 - z0)[k] / length[k], -(r1 - r0)[k] / length[k]
         normals = np.column_stack([n_r * np.cos(turn), n_r * np.sin(turn), n_z]) @ T_rack_tube[:3, :3].T
-        kept &= normals @ seen_from > 0
+        kept &= normals @ seen_from > rng.uniform(size=len(k))
     return points[kept]
+
+
+def towards_camera(T_camera_rack: FloatArray) -> FloatArray:
+    """Unit direction from the rack to the camera, rack frame."""
+    return np.asarray(-T_camera_rack[2, :3])
 
 
 def camera_from_rack(

@@ -14,7 +14,7 @@ CLI = ROOT / "cli"
 
 # Everyone may use these; they use nothing of ours but one another.
 BASE = {"errors", "transforms"}
-STAGES = {"rack", "slots", "tube", "pipeline", "baselines", "detection"}
+STAGES = {"rack", "rack_acceptance", "slots", "tube", "pipeline", "baselines", "detection"}
 
 # Part of the library -> the other parts that it may import (BASE goes without saying).
 ALLOWED: dict[str, set[str]] = {
@@ -25,7 +25,8 @@ ALLOWED: dict[str, set[str]] = {
     "config": {"labware"},
     "preprocessing": {"config", "labware"},
     "detection": {"capture", "config", "labware", "preprocessing"},
-    "rack": {"capture", "config", "labware", "preprocessing", "detection"},
+    "rack_acceptance": {"config", "labware"},
+    "rack": {"capture", "config", "labware", "preprocessing", "rack_acceptance"},
     "slots": {"config", "labware", "preprocessing", "detection", "rack"},
     "tube": {"config", "labware", "preprocessing", "slots"},
     "baselines": {"config", "labware", "preprocessing", "slots", "tube"},

@@ -13,7 +13,6 @@ from itertools import permutations, product
 
 import numpy as np
 import open3d as o3d
-from scipy.spatial import cKDTree
 
 from tubepose.capture.frame import CameraIntrinsics
 from tubepose.capture.session import SlotHint
@@ -30,6 +29,7 @@ from tubepose.preprocessing import (
     to_o3d,
     voxel_downsample,
 )
+from tubepose.rack_acceptance import agreement, refusal, too_coarse, too_noisy
 from tubepose.transforms import FloatArray, invert_transform, make_transform, transform_points
 
 HALF_TURN = np.diag([-1.0, -1.0, 1.0, 1.0])
@@ -121,7 +121,7 @@ def register_rack(
     if pose.status is not RackStatus.INSUFFICIENT:
         noise_m = level_noise_m(points_m, config.rack_top)
         if noise_m > config.rack.max_inlier_rmse_m:
-            return replace(pose, status=RackStatus.INSUFFICIENT, reason=_too_noisy(noise_m, pose.reason, config.rack))
+            return replace(pose, status=RackStatus.INSUFFICIENT, reason=too_noisy(noise_m, pose.reason, config.rack))
     return pose
 
 
@@ -137,14 +137,15 @@ def _register(
     band = points_m[top.band_rows]
     spacing_m = point_spacing_m(band)
     scan = remove_outliers(voxel_downsample(band, config.preprocess.rack_voxel_m), config.preprocess)
-    coarse = _too_coarse(spacing_m, rack, config.rack)
+    coarse = too_coarse(spacing_m, rack, config.rack)
     if coarse:
         return RackPose(RackStatus.INSUFFICIENT, coarse, spacing_m=spacing_m)
     best, turned = _register_all(scan, top, rack, config.rack)
     margin_m = turned.inlier_rmse_m - best.inlier_rmse_m
     chosen, resolved_by = _choose_turn(best, turned, rack, config.rack, hint, intrinsics)
-    in_slot, coverage = _agreement(scan, chosen.T_camera_rack, rack, config.rack)
-    reason = _refusal(chosen, in_slot, coverage, rack, config.rack)
+    template_m = rack_template_m(rack, config.rack.template_spacing_m)
+    in_slot, coverage = agreement(scan, chosen.T_camera_rack, template_m, rack, config.rack)
+    reason = refusal(chosen.fitness, chosen.inlier_rmse_m, in_slot, coverage, rack, config.rack)
     return RackPose(
         RackStatus.REFUSED if reason else RackStatus.OK,
         reason,
@@ -162,7 +163,7 @@ def _register(
 
 def _not_found(points_m: FloatArray, top: RackTop | None, rack: RackModel, config: RackConfig) -> RackPose:
     spacing_m = point_spacing_m(points_m)
-    coarse = _too_coarse(spacing_m, rack, config)
+    coarse = too_coarse(spacing_m, rack, config)
     if coarse:
         return RackPose(RackStatus.INSUFFICIENT, coarse, spacing_m=spacing_m)
     found = "no level band" if top is None else f"a band of {top.size_m[0] * 1e3:.1f} x {top.size_m[1] * 1e3:.1f} mm"
@@ -187,23 +188,6 @@ def _unit_suspicion(points_m: FloatArray, rack: RackModel, config: Config) -> st
 
 def _outline_mm(rack: RackModel) -> str:
     return " x ".join(f"{side:g}" for side in rack.outline_mm)
-
-
-def _too_noisy(noise_m: float, reason: str, config: RackConfig) -> str:
-    return (
-        f"depth scatters by {noise_m * 1e3:.1f} mm on level patches, "
-        f"at most {config.max_inlier_rmse_m * 1e3:.1f} mm can be registered ({reason})"
-    )
-
-
-def _too_coarse(spacing_m: float, rack: RackModel, config: RackConfig) -> str:
-    limit_m = config.max_spacing_ratio * rack.min_rib_m
-    if spacing_m <= limit_m:
-        return ""
-    return (
-        f"points are {spacing_m * 1e3:.2f} mm apart, and the ribs of {rack.name} are "
-        f"{rack.min_rib_m * 1e3:.2f} mm wide; a finer or nearer scan is needed"
-    )
 
 
 def _hypotheses(top: RackTop, band_m: FloatArray, rack: RackModel) -> list[FloatArray]:
@@ -290,36 +274,3 @@ def _choose_turn(
             return pair[0 if distances[0] < distances[1] else 1], "hint"
     # Decided by the image's diagonal: racks stand along the image's sides more often than along its diagonal.
     return pair[0 if best.T_camera_rack[:2, 0].sum() > 0 else 1], "rule"
-
-
-def _agreement(
-    scan_m: FloatArray, T_camera_rack: FloatArray, rack: RackModel, config: RackConfig
-) -> tuple[float, float]:
-    """Share of the scan inside the openings, and share of the template that the scan covers."""
-    in_rack = transform_points(invert_transform(T_camera_rack), scan_m)
-    inside_outline = np.all(np.abs(in_rack[:, :2]) <= rack.outline_m / 2, axis=1)
-    in_slot = inside_outline & (rack.top_signed_distance_m(in_rack[:, :2]) > config.slot_margin_m)
-    template_m = rack_template_m(rack, config.template_spacing_m)[::7]
-    distances, _ = cKDTree(in_rack).query(template_m, distance_upper_bound=2.5e-3)
-    return float(in_slot.mean()), float(np.isfinite(distances).mean())
-
-
-def _refusal(found: _Registration, in_slot: float, coverage: float, rack: RackModel, config: RackConfig) -> str:
-    """Why a registration is no rack, in words; empty if it is one."""
-    checks = (
-        (found.fitness < config.min_fitness, f"fitness {found.fitness:.3f}, at least {config.min_fitness} expected"),
-        (
-            found.inlier_rmse_m > config.max_inlier_rmse_m,
-            f"inlier rmse {found.inlier_rmse_m * 1e3:.2f} mm, at most {config.max_inlier_rmse_m * 1e3:.2f} mm expected",
-        ),
-        (
-            in_slot > config.max_in_slot_share,
-            f"{in_slot:.1%} of the top's points lie inside the openings of {rack.name}, "
-            f"at most {config.max_in_slot_share:.1%} expected: another rack?",
-        ),
-        (
-            coverage < config.min_coverage,
-            f"{coverage:.1%} of the top seen, at least {config.min_coverage:.0%} expected",
-        ),
-    )
-    return "; ".join(text for failed, text in checks if failed)
