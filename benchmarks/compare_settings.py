@@ -17,13 +17,14 @@ from typing import get_args
 import numpy as np
 import pandas as pd
 
-from tubepose.batch import ESTIMATE_COLUMNS, run_jobs, session_jobs, to_table
+from tubepose.batch import run_jobs, session_jobs
 from tubepose.capture.session import Session, load_session
 from tubepose.config import Config, IcpConfig, Objective, TubeConfig
 from tubepose.detection.geometric import GeometricDetector
 from tubepose.evaluation import evaluate, summarise
 from tubepose.ground_truth import GroundTruthConfig
 from tubepose.provenance import pinned_threads
+from tubepose.records import ESTIMATE_COLUMNS, to_table
 from tubepose.truth_tables import TRUTH_COLUMNS, TruthTables, measure_session
 
 SEEDS = 2

@@ -87,9 +87,9 @@ def _report(
     seeds: int, published: bool,
 ) -> None:  # fmt: skip
     """Evaluate, write and print."""
-    from tubepose.batch import ESTIMATE_COLUMNS, SLOT_COLUMNS, TIMING_COLUMNS, to_table
     from tubepose.evaluation import compare, evaluate, seed_spread, slot_accuracy, summarise
     from tubepose.pipeline import STOCHASTIC
+    from tubepose.records import ESTIMATE_COLUMNS, SLOT_COLUMNS, TIMING_COLUMNS, to_table
     from tubepose.report.tables import accuracy_table, timing_table
     from tubepose.report.writing import write_csv, write_table
     from tubepose_cli.show import say, show_table

@@ -29,8 +29,9 @@ def run_estimates(
     **more: Any,
 ) -> Tables:
     """Run jobs and write racks.csv, slots.csv, estimates.csv, timings.csv, run.json and overlays/ into `out`."""
-    from tubepose.batch import ESTIMATE_COLUMNS, RACK_COLUMNS, SLOT_COLUMNS, TIMING_COLUMNS, run_jobs, to_table
+    from tubepose.batch import run_jobs
     from tubepose.provenance import pinned_threads, run_record
+    from tubepose.records import ESTIMATE_COLUMNS, RACK_COLUMNS, SLOT_COLUMNS, TIMING_COLUMNS, to_table
     from tubepose.report.writing import write_csv, write_json
     from tubepose_cli.show import progress
 

@@ -38,11 +38,11 @@ def measure_sessions(folders: Sequence[Path], out: Path, *, fail_fast: bool = Fa
     """Measure all sessions and write ground_truth.csv (and ground_truth_floor.csv if one is simulated) into `out`."""
     from dataclasses import asdict
 
-    from tubepose.batch import to_table
     from tubepose.capture.session import load_session
     from tubepose.errors import TubePoseError
     from tubepose.ground_truth import GroundTruthConfig
     from tubepose.provenance import pinned_threads
+    from tubepose.records import to_table
     from tubepose.report.writing import write_csv
     from tubepose.truth_tables import (
         FLOOR_COLUMNS,

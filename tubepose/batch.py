@@ -1,4 +1,4 @@
-"""Many captures through the pipeline: what to run, and tidy rows of what came out (docs/outputs.md).
+"""Many captures through the pipeline.
 
 One bad capture never stops a batch: its one-line problem is kept, and the next one is done.
 """
@@ -8,10 +8,6 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
-from typing import Any
-
-import numpy as np
-import pandas as pd
 
 from tubepose.capture.frame import RgbdFrame
 from tubepose.capture.session import Session, SlotHint, Trial
@@ -22,11 +18,10 @@ from tubepose.errors import CaptureError, TubePoseError
 from tubepose.labware import RackModel, TubeModel
 from tubepose.pipeline import DEFAULT_METHOD, STOCHASTIC, Scene, StageTime, TubeEstimate, estimate_tubes, prepare_scene
 from tubepose.rack import RackStatus
-from tubepose.transforms import FloatArray, quaternion_wxyz, tilt_rad
+from tubepose.records import Row, estimate_row, rack_row, slot_rows, timing_row
+from tubepose.transforms import FloatArray
 
-Row = dict[str, Any]
 DetectorFactory = Callable[[RackModel, tuple[TubeModel, ...]], Detector]
-POSE_COLUMNS = ("tx_m", "ty_m", "tz_m", "qw", "qx", "qy", "qz")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -69,50 +64,6 @@ class Tables:
     estimates: list[Row] = field(default_factory=list)
     timings: list[Row] = field(default_factory=list)
     problems: list[str] = field(default_factory=list)
-
-
-RACK_COLUMNS = (
-    "session", "trial", "capture", "frame", "timestamp_ns", "method", "rack", "status", "reason", "ambiguous",
-    "resolved_by", "turn_margin_m", "inlier_rmse_m", "fitness", "in_slot_share", "coverage", "spacing_m",
-    "n_tubes_detected", *POSE_COLUMNS,
-)  # fmt: skip
-SLOT_COLUMNS = (
-    "session",
-    "trial",
-    "capture",
-    "frame",
-    "method",
-    "slot",
-    "occupied",
-    "tube",
-    "share",
-    "n_points",
-    "status",
-    "reason",
-)
-ESTIMATE_COLUMNS = (
-    "session", "trial", "capture", "frame", "timestamp_ns", "method", "seed", "slot", "tube", "status", "reason",
-    "score", *POSE_COLUMNS, "tilt_deg", "inlier_rmse_m", "fitness", "n_points",
-)  # fmt: skip
-TIMING_COLUMNS = (
-    "session",
-    "trial",
-    "capture",
-    "frame",
-    "method",
-    "seed",
-    "stage",
-    "instance",
-    "duration_ms",
-    "warmup",
-)
-_WHOLE = ("timestamp_ns", "seed")
-
-
-def to_table(rows: Sequence[Row], columns: Sequence[str]) -> pd.DataFrame:
-    """Rows as a table with exactly these columns; stamps and seeds stay whole numbers (Int64)."""
-    table = pd.DataFrame(list(rows), columns=list(columns))
-    return table.astype({name: "Int64" for name in _WHOLE if name in columns})
 
 
 def session_jobs(session: Session) -> tuple[list[Job], list[str]]:
@@ -221,98 +172,15 @@ def _run_frame(
         for seed in range(seeds) if method in STOCHASTIC else (None,):
             estimates, tube_times = estimate_tubes(scene, method, config, seed)
             times += tube_times
-            tables.estimates += [_estimate_row(keys, scene, estimate) for estimate in estimates]
+            tables.estimates += [estimate_row(keys, scene, estimate) for estimate in estimates]
             if method == shown_method and seed in (None, 0):
                 shown = estimates
             if seed in (None, 0):
-                tables.racks.append({**keys, "method": method, **_rack_row(scene)})
-                tables.slots += _slot_rows(keys, method, scene, estimates)
+                tables.racks.append({**keys, "method": method, **rack_row(scene)})
+                tables.slots += slot_rows(keys, method, scene, estimates)
     timings = tables.timings if warm_timings is None else warm_timings
-    timings += [_timing_row(keys, entry, warm_timings is not None) for entry in times]
+    timings += [timing_row(keys, entry, warm_timings is not None) for entry in times]
     if on_scene is not None:
         on_scene(job, scene, shown)
     if scene.rack_pose.status is RackStatus.UNIT and warm_timings is None:
         raise CaptureError(scene.rack_pose.reason)
-
-
-def pose_columns(T: FloatArray | None) -> Row:
-    """A (4, 4) transform as the columns tx_m ... qz; NaN without one."""
-    if T is None:
-        return dict.fromkeys(POSE_COLUMNS, float("nan"))
-    return dict(zip(POSE_COLUMNS, (*(float(value) for value in T[:3, 3]), *quaternion_wxyz(T)), strict=True))
-
-
-def _rack_row(scene: Scene) -> Row:
-    pose = scene.rack_pose
-    return {
-        "timestamp_ns": scene.frame.timestamp_ns,
-        "rack": scene.rack.name,
-        "status": pose.status.value,
-        "reason": pose.reason,
-        "ambiguous": pose.ambiguous,
-        "resolved_by": pose.resolved_by,
-        "turn_margin_m": pose.turn_margin_m,
-        "inlier_rmse_m": pose.inlier_rmse_m,
-        "fitness": pose.fitness,
-        "in_slot_share": pose.in_slot_share,
-        "coverage": pose.coverage,
-        "spacing_m": pose.spacing_m,
-        "n_tubes_detected": sum(not detection.is_rack for detection in scene.detections),
-        **pose_columns(pose.T_camera_rack),
-    }
-
-
-def _slot_rows(keys: Row, method: str, scene: Scene, estimates: Sequence[TubeEstimate]) -> list[Row]:
-    if scene.rack_pose.T_camera_rack is None:
-        return []
-    held = {estimate.target.slot: estimate for estimate in estimates if estimate.target.slot is not None}
-    rows = []
-    for slot in scene.rack.all_slots:
-        estimate = held.get(slot.name)
-        row: Row = {**keys, "method": method, "slot": slot.name, "occupied": estimate is not None, "n_points": 0}
-        if estimate is not None:
-            target = estimate.target
-            row |= {
-                "tube": target.tube.name if target.tube is not None else None,
-                "share": target.share,
-                "n_points": len(target.points_m),
-                "status": estimate.pose.status.value,
-                "reason": estimate.pose.reason,
-            }
-        rows.append(row)
-    return rows
-
-
-def _estimate_row(keys: Row, scene: Scene, estimate: TubeEstimate) -> Row:
-    pose, target = estimate.pose, estimate.target
-    tilt_deg = float("nan")
-    if pose.T_rack_tube is not None:
-        tilt_deg = float(np.rad2deg(tilt_rad(pose.T_rack_tube[:3, 2], np.array([0.0, 0.0, 1.0]))))
-    return {
-        **keys,
-        "timestamp_ns": scene.frame.timestamp_ns,
-        "method": estimate.method,
-        "seed": estimate.seed,
-        "slot": target.slot,
-        "tube": target.tube.name if target.tube is not None else None,
-        "status": pose.status.value,
-        "reason": pose.reason,
-        "score": pose.score,
-        **pose_columns(estimate.T_camera_tube),
-        "tilt_deg": tilt_deg,
-        "inlier_rmse_m": pose.inlier_rmse_m,
-        "fitness": pose.fitness,
-        "n_points": pose.n_points,
-    }
-
-
-def _timing_row(keys: Row, entry: StageTime, warmup: bool) -> Row:
-    return {
-        **keys,
-        "method": entry.method,
-        "seed": entry.seed,
-        "stage": entry.stage,
-        "instance": entry.instance,
-        "duration_ms": entry.duration_ms,
-        "warmup": warmup,
-    }

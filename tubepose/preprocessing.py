@@ -190,7 +190,8 @@ def _candidates(
         return
     edges = np.arange(low - config.bin_m, high + 2 * config.bin_m, config.bin_m)
     counts = np.histogram(heights, edges)[0].astype(float)
-    smooth = np.convolve(counts, [0.25, 0.5, 1.0, 0.5, 0.25], mode="same")
+    # Not mode "same": it returns five values for the three bins of a perfectly flat cloud.
+    smooth = np.convolve(counts, [0.25, 0.5, 1.0, 0.5, 0.25])[2:-2]
     padded = np.pad(smooth, 1)
     peaks = np.flatnonzero((smooth >= padded[:-2]) & (smooth > padded[2:]) & (smooth >= 1e-3 * len(points_m)))
     for peak in peaks[np.argsort(-smooth[peaks], kind="stable")][:16]:

@@ -9,11 +9,12 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from tubepose.batch import POSE_COLUMNS, Job, Row, pose_columns, trial_capture
+from tubepose.batch import Job, trial_capture
 from tubepose.capture.session import Session, Trial
 from tubepose.errors import CaptureError, ConfigError, TubePoseError
 from tubepose.ground_truth import GroundTruthConfig, GroundTruthResult, measure_ground_truth
 from tubepose.pose_errors import pose_errors
+from tubepose.records import POSE_COLUMNS, Row, pose_columns
 from tubepose.simulation import read_exact_truth
 from tubepose.transforms import FloatArray
 

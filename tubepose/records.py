@@ -1,0 +1,144 @@
+"""Tidy rows of the result files: what every column holds, docs/outputs.md says in words."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from tubepose.pipeline import Scene, StageTime, TubeEstimate
+from tubepose.transforms import FloatArray, quaternion_wxyz, tilt_rad
+
+Row = dict[str, Any]
+POSE_COLUMNS = ("tx_m", "ty_m", "tz_m", "qw", "qx", "qy", "qz")
+RACK_COLUMNS = (
+    "session", "trial", "capture", "frame", "timestamp_ns", "method", "rack", "status", "reason", "ambiguous",
+    "resolved_by", "turn_margin_m", "inlier_rmse_m", "fitness", "in_slot_share", "coverage", "spacing_m",
+    "n_tubes_detected", *POSE_COLUMNS,
+)  # fmt: skip
+SLOT_COLUMNS = (
+    "session",
+    "trial",
+    "capture",
+    "frame",
+    "method",
+    "slot",
+    "occupied",
+    "tube",
+    "share",
+    "n_points",
+    "status",
+    "reason",
+)
+ESTIMATE_COLUMNS = (
+    "session", "trial", "capture", "frame", "timestamp_ns", "method", "seed", "slot", "tube", "status", "reason",
+    "score", *POSE_COLUMNS, "tilt_deg", "inlier_rmse_m", "fitness", "n_points",
+)  # fmt: skip
+TIMING_COLUMNS = (
+    "session",
+    "trial",
+    "capture",
+    "frame",
+    "method",
+    "seed",
+    "stage",
+    "instance",
+    "duration_ms",
+    "warmup",
+)
+_WHOLE = ("timestamp_ns", "seed")
+
+
+def to_table(rows: Sequence[Row], columns: Sequence[str]) -> pd.DataFrame:
+    """Rows as a table with exactly these columns; stamps and seeds stay whole numbers (Int64)."""
+    table = pd.DataFrame(list(rows), columns=list(columns))
+    return table.astype({name: "Int64" for name in _WHOLE if name in columns})
+
+
+def pose_columns(T: FloatArray | None) -> Row:
+    """A (4, 4) transform as the columns tx_m ... qz; NaN without one."""
+    if T is None:
+        return dict.fromkeys(POSE_COLUMNS, float("nan"))
+    return dict(zip(POSE_COLUMNS, (*(float(value) for value in T[:3, 3]), *quaternion_wxyz(T)), strict=True))
+
+
+def rack_row(scene: Scene) -> Row:
+    """Row of racks.csv, without its keys."""
+    pose = scene.rack_pose
+    return {
+        "timestamp_ns": scene.frame.timestamp_ns,
+        "rack": scene.rack.name,
+        "status": pose.status.value,
+        "reason": pose.reason,
+        "ambiguous": pose.ambiguous,
+        "resolved_by": pose.resolved_by,
+        "turn_margin_m": pose.turn_margin_m,
+        "inlier_rmse_m": pose.inlier_rmse_m,
+        "fitness": pose.fitness,
+        "in_slot_share": pose.in_slot_share,
+        "coverage": pose.coverage,
+        "spacing_m": pose.spacing_m,
+        "n_tubes_detected": sum(not detection.is_rack for detection in scene.detections),
+        **pose_columns(pose.T_camera_rack),
+    }
+
+
+def slot_rows(keys: Row, method: str, scene: Scene, estimates: Sequence[TubeEstimate]) -> list[Row]:
+    """Rows of slots.csv, one per slot of the rack; none without the rack's pose."""
+    if scene.rack_pose.T_camera_rack is None:
+        return []
+    held = {estimate.target.slot: estimate for estimate in estimates if estimate.target.slot is not None}
+    rows = []
+    for slot in scene.rack.all_slots:
+        estimate = held.get(slot.name)
+        row: Row = {**keys, "method": method, "slot": slot.name, "occupied": estimate is not None, "n_points": 0}
+        if estimate is not None:
+            target = estimate.target
+            row |= {
+                "tube": target.tube.name if target.tube is not None else None,
+                "share": target.share,
+                "n_points": len(target.points_m),
+                "status": estimate.pose.status.value,
+                "reason": estimate.pose.reason,
+            }
+        rows.append(row)
+    return rows
+
+
+def estimate_row(keys: Row, scene: Scene, estimate: TubeEstimate) -> Row:
+    """Row of estimates.csv."""
+    pose, target = estimate.pose, estimate.target
+    tilt_deg = float("nan")
+    if pose.T_rack_tube is not None:
+        tilt_deg = float(np.rad2deg(tilt_rad(pose.T_rack_tube[:3, 2], np.array([0.0, 0.0, 1.0]))))
+    return {
+        **keys,
+        "timestamp_ns": scene.frame.timestamp_ns,
+        "method": estimate.method,
+        "seed": estimate.seed,
+        "slot": target.slot,
+        "tube": target.tube.name if target.tube is not None else None,
+        "status": pose.status.value,
+        "reason": pose.reason,
+        "score": pose.score,
+        **pose_columns(estimate.T_camera_tube),
+        "tilt_deg": tilt_deg,
+        "inlier_rmse_m": pose.inlier_rmse_m,
+        "fitness": pose.fitness,
+        "n_points": pose.n_points,
+    }
+
+
+def timing_row(keys: Row, entry: StageTime, warmup: bool) -> Row:
+    """Row of timings.csv."""
+    return {
+        **keys,
+        "method": entry.method,
+        "seed": entry.seed,
+        "stage": entry.stage,
+        "instance": entry.instance,
+        "duration_ms": entry.duration_ms,
+        "warmup": warmup,
+    }
