@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import textwrap
 from collections.abc import Callable, Sequence
 
 import cv2
@@ -45,8 +46,7 @@ def draw_overlay(scene: Scene, estimates: Sequence[TubeEstimate]) -> Picture:
         if estimate.T_camera_tube is not None:
             _draw_tube(picture, estimate, project)
     _draw_names(picture, scene, estimates, project)
-    _legend(picture, scene, estimates)
-    return picture
+    return np.vstack([_legend(picture.shape[1], scene, estimates), picture])
 
 
 class _ImageView:
@@ -183,7 +183,8 @@ def _draw_names(picture: Picture, scene: Scene, estimates: Sequence[TubeEstimate
             _text(picture, slot.name, (u - 12, v + 5), 0.45, colors.get(slot.name, _TEXT_BGR))
 
 
-def _legend(picture: Picture, scene: Scene, estimates: Sequence[TubeEstimate]) -> None:
+def _legend(width: int, scene: Scene, estimates: Sequence[TubeEstimate]) -> Picture:
+    """A strip of text for the top of the picture, shape (h, width, 3)."""
     pose = scene.rack_pose
     rack = f"rack {scene.rack.name}: {pose.status.value}"
     if pose.reason:
@@ -191,12 +192,15 @@ def _legend(picture: Picture, scene: Scene, estimates: Sequence[TubeEstimate]) -
     if pose.ambiguous:
         rack += ", turn ambiguous by 180 deg (chosen by rule)"
     counts = {status: sum(e.pose.status.value == status for e in estimates) for status in COLORS_BGR}
-    method = estimates[0].method if estimates else "no tubes"
     kind = "SIMULATED" if scene.frame.simulated else "recorded"
     lines = [(f"{scene.frame.capture} frame {scene.frame.index} ({kind})", _TEXT_BGR)]
-    limit = max(20, picture.shape[1] // 10)
-    lines += [(rack[i : i + limit], _RACK_BGR) for i in range(0, min(len(rack), 3 * limit), limit)]
-    lines.append((f"method {method}", _TEXT_BGR))
-    lines += [(f"{status}: {counts[status]}", COLORS_BGR[status]) for status in COLORS_BGR]
+    lines += [(part, _RACK_BGR) for part in textwrap.wrap(rack, max(20, width // 11))]
+    strip = np.full((24 * (len(lines) + 1) + 12, width, 3), 30, np.uint8)
     for i, (text, color) in enumerate(lines):
-        _text(picture, text, (12, 26 + 24 * i), 0.6, color)
+        _text(strip, text, (12, 24 + 24 * i), 0.6, color)
+    method = f"method {estimates[0].method}" if estimates else "no tubes"
+    u, v = 12, 24 + 24 * len(lines)
+    for text, color in [(method, _TEXT_BGR), *((f"{name}: {counts[name]}", COLORS_BGR[name]) for name in COLORS_BGR)]:
+        _text(strip, text, (u, v), 0.6, color)
+        u += 12 * len(text) + 24
+    return strip
