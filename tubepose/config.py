@@ -91,7 +91,7 @@ class RackConfig(_Section):
     max_inlier_rmse_m: float = 1.1e-3
     min_fitness: float = 0.9
     slot_margin_m: float = 1.5e-3
-    max_in_slot_share: float = 0.04
+    max_in_slot_share: float = 0.06
     min_coverage: float = 0.25
     ambiguous_margin_m: float = 5.0e-5
     max_spacing_ratio: float = 1.0
