@@ -14,7 +14,7 @@ demo: .venv/.ready
 	$(BIN)/tubepose bench --out out/demo
 
 test: .venv/.ready
-	$(BIN)/python -m pytest -n $(JOBS)
+	$(BIN)/python -m pytest -n $(JOBS) --dist loadfile
 
 lint: .venv/.ready
 	$(BIN)/ruff check .

@@ -51,7 +51,7 @@ def bench(
     from tubepose.truth_tables import with_exact_rack
     from tubepose_cli.inputs import find_sessions, make_detector, read_methods, sample_session
     from tubepose_cli.results import run_estimates
-    from tubepose_cli.show import finish
+    from tubepose_cli.show import finish, say
     from tubepose_cli.truth import measure_sessions
 
     settings = load_config(config)
@@ -69,16 +69,26 @@ def bench(
             problems.append(str(problem))
     measured = measure_sessions(folders, out, fail_fast=fail_fast)
     for session in measured.sessions:
-        found, unread = session_jobs(session)
-        jobs += with_exact_rack(found, session) if known_rack else found
-        problems += unread
+        try:
+            found, unread = session_jobs(session, fail_fast=fail_fast)
+            jobs += with_exact_rack(found, session) if known_rack else found
+            problems += unread
+        except TubePoseError as problem:
+            if fail_fast:
+                raise
+            problems.append(str(problem))
     tables = run_estimates(
         jobs, names, detector_for, settings, out, sys.argv, seeds=seeds, overlays=overlays, fail_fast=fail_fast,
-        warm_up=True, inputs=[path for path in (model, boxes, config) if path is not None], detector=detector,
-        ground_truth_config=measured.config,
+        warm_up=True, inputs=[
+            *(path for path in (model, boxes, classes, config) if path is not None),
+            *(session.folder for session in measured.sessions),
+        ],
+        problems=[*problems, *measured.problems], detector=detector, ground_truth_config=measured.config,
     )  # fmt: skip
     if len(measured.truth):
         _report(tables, measured, jobs, names, settings, out, seeds, published)
+    else:
+        say("no trial has a capture with printed caps that could be measured: no errors, no tables")
     finish([*problems, *measured.problems, *tables.problems])
 
 

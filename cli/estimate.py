@@ -42,10 +42,11 @@ def estimate(
     Writes racks.csv, slots.csv, estimates.csv, timings.csv, run.json and overlays/ into --out.
     """
     from tubepose.batch import Job
+    from tubepose.capture.session import SESSION_FILE, is_session
     from tubepose.config import load_config
-    from tubepose.errors import TubePoseError
+    from tubepose.errors import CaptureError, TubePoseError
     from tubepose.labware import load_rack
-    from tubepose_cli.inputs import capture_jobs, make_detector, read_methods, read_tubes
+    from tubepose_cli.inputs import capture_jobs, make_detector, read_methods, read_tubes, refuse_twins
     from tubepose_cli.results import run_estimates
     from tubepose_cli.show import finish, say
 
@@ -59,27 +60,33 @@ def estimate(
     problems: list[str] = []
     for path in captures:
         try:
-            found, unread = capture_jobs(path, rack_model, tube_models, unit=unit, hint=hint, topics=topics)
-            jobs += found
-            problems += unread
+            found, unread = capture_jobs(
+                path, rack_model, tube_models, unit=unit, hint=hint, topics=topics, fail_fast=fail_fast
+            )
+            kept, twins = refuse_twins(found, jobs)
+            if twins and fail_fast:
+                raise CaptureError(twins[0])
+            jobs += kept
+            problems += [*unread, *twins]
         except TubePoseError as problem:
             if fail_fast:
                 raise
             problems.append(str(problem))
     tables = run_estimates(
         jobs, methods, detector_for, settings, out, sys.argv, seeds=seeds, overlays=overlays, fail_fast=fail_fast,
-        inputs=[path for path in (model, boxes, config) if path is not None], detector=detector,
+        inputs=[
+            *(path for path in (model, boxes, classes, config) if path is not None),
+            *(path for path in captures if path.exists() and (path.name == SESSION_FILE or is_session(path))),
+        ],
+        problems=problems, detector=detector,
     )  # fmt: skip
     for row in tables.racks:
         turn = ", turn ambiguous by 180 degrees" if row["ambiguous"] else ""
         if row["status"] == "ok":
-            found = f"ok, inlier rmse {row['inlier_rmse_m'] * 1e3:.2f} mm{turn}"
+            rack_words = f"ok, inlier rmse {row['inlier_rmse_m'] * 1e3:.2f} mm{turn}"
         else:
-            found = f"{row['status']}: {row['reason']}"
-        held = sum(
-            e["status"] == "ok"
-            for e in tables.estimates
-            if (e["capture"], e["frame"]) == (row["capture"], row["frame"])
-        )
-        say(f"{row['capture']} frame {row['frame']}: rack {row['rack']} {found}; {held} tubes ok")
+            rack_words = f"{row['status']}: {row['reason']}"
+        keys = ("session", "trial", "capture", "frame", "method")
+        held = sum(e["status"] == "ok" for e in tables.estimates if all(e[key] == row[key] for key in keys))
+        say(f"{row['capture']} frame {row['frame']}: rack {row['rack']} {rack_words}; {held} tubes ok")
     finish([*problems, *tables.problems])

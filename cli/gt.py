@@ -37,9 +37,13 @@ def gt(
                 raise
             problems.append(str(problem))
     measured = measure_sessions(folders, out, fail_fast=fail_fast)
+    problems += measured.problems
+    caps = [session.printed_cap for session in measured.sessions if session.printed_cap is not None]
     labware = [item for session in measured.sessions for item in (session.rack, *session.tubes.values())]
-    record = run_record(sys.argv, Config(), labware, folders, ground_truth_config=measured.config)
+    record = run_record(
+        sys.argv, Config(), [*labware, *caps], folders, problems=problems, ground_truth_config=measured.config
+    )
     write_json(out / "run.json", record)
     for line in measured.notes:
         say(line)
-    finish([*problems, *measured.problems])
+    finish(problems)

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import difflib
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -42,9 +43,19 @@ def read_methods(names: str) -> tuple[str, ...]:
 
     methods = tuple(dict.fromkeys(name.strip() for name in names.split(",") if name.strip()))
     unknown = [name for name in methods if name not in METHODS]
-    if unknown or not methods:
-        raise ConfigError(f"unknown method '{', '.join(unknown)}'; known: {', '.join(METHODS)}")
+    if unknown:
+        raise ConfigError(unknown_name("method", unknown[0], METHODS))
+    if not methods:
+        raise ConfigError(f"no method is named; expected one or more of {', '.join(METHODS)}")
     return methods
+
+
+def unknown_name(kind: str, name: str, known: Iterable[str]) -> str:
+    """What to say of a name that is not known: the nearest one, and all."""
+    known = list(known)
+    close = difflib.get_close_matches(name, known, n=1)
+    guess = f"; did you mean '{close[0]}'?" if close else ""
+    return f"unknown {kind} '{name}'{guess}; known: {', '.join(known)}"
 
 
 def find_sessions(paths: Sequence[Path]) -> list[Path]:
@@ -54,6 +65,8 @@ def find_sessions(paths: Sequence[Path]) -> list[Path]:
 
     sessions: list[Path] = []
     for path in paths:
+        if not path.exists():
+            raise CaptureError(f"{path}: no such file or folder; expected a session folder")
         folder = path.parent if path.name == "session.yaml" else path
         found = [folder] if is_session(folder) else sorted(p.parent for p in folder.glob("*/session.yaml"))
         if not found:
@@ -70,6 +83,7 @@ def capture_jobs(
     unit: str | None = None,
     hint: str | None = None,
     topics: Mapping[str, str | None] | None = None,
+    fail_fast: bool = False,
 ) -> tuple[list[Job], list[str]]:
     """Jobs of one typed path (a session's trials, or the captures found there), and what could not be opened.
 
@@ -81,7 +95,7 @@ def capture_jobs(
     from tubepose.errors import CaptureError, ConfigError
 
     if path.name == SESSION_FILE or (path.is_dir() and is_session(path)):
-        jobs, problems = session_jobs(load_session(path))
+        jobs, problems = session_jobs(load_session(path), fail_fast=fail_fast)
         changed = [replace(job, rack=rack or job.rack, tubes=tubes or job.tubes) for job in jobs]
         return changed, list(problems)
     if not path.exists():
@@ -106,8 +120,32 @@ def read_hint(text: str, rack: RackModel) -> SlotHint:
     except ValueError:
         raise ConfigError(f"--hint {text}: expected SLOT@U,V, for example A1@412,300") from None
     if slot not in {known.name for known in rack.all_slots}:
-        raise ConfigError(f"--hint {text}: no slot {slot} in rack {rack.name}")
+        raise ConfigError(f"--hint {text}: no slot {slot} in rack {rack.name}; {_slot_range(rack)}")
     return SlotHint(slot=slot, pixel=(u, v))
+
+
+def _slot_range(rack: RackModel) -> str:
+    return f"its slots run from {rack.all_slots[0].name} to {rack.all_slots[-1].name}"
+
+
+def refuse_twins(found: Sequence[Job], others: Sequence[Job]) -> tuple[list[Job], list[str]]:
+    """The jobs that differ from all before them by name, and one line per capture that does not.
+
+    Rows are told apart by session, trial and capture, and pictures are named by them.
+    """
+    places = {(job.session, job.trial, job.capture.name): job.capture.path for job in others}
+    kept, problems = [], []
+    for job in found:
+        key = (job.session, job.trial, job.capture.name)
+        if key in places:
+            problems.append(
+                f"{job.capture.path}: {places[key]} has the same name '{job.capture.name}', so the rows could not be "
+                "told apart; give the folder above both, or rename one"
+            )
+            continue
+        places[key] = job.capture.path
+        kept.append(job)
+    return kept, problems
 
 
 def make_detector(
@@ -136,4 +174,4 @@ def make_detector(
 
         recorded = RecordedDetector(boxes, classes=classes)
         return lambda _rack, _tubes: recorded
-    raise ConfigError(f"unknown detector '{name}'; known: geometric, yolo, recorded")
+    raise ConfigError(unknown_name("detector", name, ("geometric", "yolo", "recorded")))

@@ -26,20 +26,24 @@ def run_estimates(
     fail_fast: bool = False,
     warm_up: bool = False,
     inputs: Sequence[Path] = (),
+    problems: Sequence[str] = (),
     **more: Any,
 ) -> Tables:
-    """Run jobs and write racks.csv, slots.csv, estimates.csv, timings.csv, run.json and overlays/ into `out`."""
+    """Run jobs and write racks.csv, slots.csv, estimates.csv, timings.csv, run.json and overlays/ into `out`.
+
+    `problems` are those from before, for the record.
+    """
     from tubepose.batch import run_jobs
     from tubepose.provenance import pinned_threads, run_record
     from tubepose.records import ESTIMATE_COLUMNS, RACK_COLUMNS, SLOT_COLUMNS, TIMING_COLUMNS, to_table
-    from tubepose.report.writing import write_csv, write_json
+    from tubepose.report.writing import make_folder, write_csv, write_json
     from tubepose_cli.show import progress
 
     def draw(job: Job, scene: Scene, estimates: tuple[TubeEstimate, ...]) -> None:
         if overlays:
             write_overlay(out / "overlays", job, scene, estimates)
 
-    out.mkdir(parents=True, exist_ok=True)
+    make_folder(out)
     with pinned_threads(1), progress("captures", len(jobs)) as step:
         tables = run_jobs(
             jobs, methods, detector_for, config, seeds=seeds, warm_up=warm_up, fail_fast=fail_fast,
@@ -61,7 +65,7 @@ def run_estimates(
         methods=list(methods),
         seeds=list(range(seeds)),
         threads=1,
-        problems=tables.problems,
+        problems=[*problems, *tables.problems],
         **more,
     )
     write_json(out / "run.json", record)
@@ -75,7 +79,6 @@ def write_overlay(folder: Path, job: Job, scene: Scene, estimates: Sequence[Tube
     from tubepose.report.overlay import draw_overlay
     from tubepose.report.writing import write_bytes
 
-    folder.mkdir(parents=True, exist_ok=True)
     name = "-".join(part for part in (job.session, scene.frame.capture) if part).replace("/", "_")
     _, png = cv2.imencode(".png", draw_overlay(scene, estimates))
     write_bytes(folder / f"{name}-{scene.frame.index:04d}.png", png.tobytes())

@@ -26,23 +26,27 @@ def simulate(
     ] = "folder",
 ) -> None:
     """Make a SIMULATED session like the paper's: printed and original caps, exact truth apart."""
-    from tubepose.errors import ConfigError
+    from tubepose.errors import CaptureError, ConfigError
     from tubepose.labware import load_cap, load_rack
     from tubepose.provenance import pinned_threads
     from tubepose.simulation import SENSORS, simulate_session
-    from tubepose_cli.inputs import read_tubes
+    from tubepose_cli.inputs import read_tubes, unknown_name
     from tubepose_cli.show import progress, say
 
     if sensor not in SENSORS:
-        raise ConfigError(f"unknown sensor '{sensor}'; known: {', '.join(SENSORS)}")
+        raise ConfigError(unknown_name("sensor", sensor, SENSORS))
     models = read_tubes(tubes)
     if not models:
         raise ConfigError("--tubes names no tube; see 'tubepose labware list'")
     total = 2 * trials * (1 if mixed else len(models))
-    with pinned_threads(0), progress("simulated captures", total) as step:
-        simulate_session(
-            out, load_rack(rack), models, trials=trials, seed=seed, cap=load_cap(cap), sensor=sensor,
-            resolution=resolution, fill=fill, mixed=mixed, capture_format=capture_format,
-            progress=lambda _done, _total: step(),
-        )  # fmt: skip
+    rack_model, cap_model = load_rack(rack), load_cap(cap)
+    try:
+        with pinned_threads(0), progress("simulated captures", total) as step:
+            simulate_session(
+                out, rack_model, models, trials=trials, seed=seed, cap=cap_model, sensor=sensor,
+                resolution=resolution, fill=fill, mixed=mixed, capture_format=capture_format,
+                progress=lambda _done, _total: step(),
+            )  # fmt: skip
+    except OSError as problem:
+        raise CaptureError(f"{out}: cannot be written ({problem.strerror}); choose another place") from None
     say(f"{out}: {total} simulated captures in {total // 2} trials; next: tubepose bench {out} --out RESULTS")

@@ -39,11 +39,11 @@ def measure_sessions(folders: Sequence[Path], out: Path, *, fail_fast: bool = Fa
     from dataclasses import asdict
 
     from tubepose.capture.session import load_session
-    from tubepose.errors import TubePoseError
+    from tubepose.errors import CaptureError, TubePoseError
     from tubepose.ground_truth import GroundTruthConfig
     from tubepose.provenance import pinned_threads
     from tubepose.records import to_table
-    from tubepose.report.writing import write_csv
+    from tubepose.report.writing import make_folder, write_csv
     from tubepose.truth_tables import (
         FLOOR_COLUMNS,
         TRUTH_COLUMNS,
@@ -54,20 +54,26 @@ def measure_sessions(folders: Sequence[Path], out: Path, *, fail_fast: bool = Fa
     )
     from tubepose_cli.show import progress
 
-    sessions, problems = [], []
+    sessions: list[Session] = []
+    problems: list[str] = []
     for folder in folders:
         try:
-            sessions.append(load_session(folder))
+            session = load_session(folder)
+            twin = next((other for other in sessions if other.name == session.name), None)
+            if twin is not None:
+                same = f"its session name '{session.name}' is that of {twin.folder} too"
+                raise CaptureError(f"{folder}: {same}; change 'name' in one of them")
+            sessions.append(session)
         except TubePoseError as problem:
             if fail_fast:
                 raise
             problems.append(str(problem))
+    make_folder(out)
     config = GroundTruthConfig()
     tables = TruthTables()
     with pinned_threads(1), progress("ground truth", sum(len(s.trials) for s in sessions)) as step:
         for session in sessions:
             measure_session(session, tables, config, fail_fast=fail_fast, on_done=step)
-    out.mkdir(parents=True, exist_ok=True)
     truth, floor = to_table(tables.truth, TRUTH_COLUMNS), to_table(tables.floor, FLOOR_COLUMNS)
     write_csv(out / "ground_truth.csv", truth)
     notes = [refused_note(truth)]

@@ -10,6 +10,7 @@ from tubepose.labware import RackModel, TubeModel
 from tubepose.transforms import FloatArray, make_transform, tilt_rotation, transform_points
 
 SPACING_M = 0.8e-3
+TUBE_SPACING_M = 0.5e-3
 NOISE_M = 0.1e-3
 CAMERA = CameraIntrinsics(640, 480, 1100.0, 1100.0, 319.5, 239.5)
 
@@ -36,7 +37,7 @@ def tube_pose(
     rack: RackModel, slot: str, alpha_rad: float = 0.0, beta_rad: float = 0.0, off_m: tuple[float, float] = (0.0, 0.0)
 ) -> FloatArray:
     """T_rack_tube of a tube that stands on a slot's floor, leaning by Eq. 1, its bottom `off_m` from the centre."""
-    origin = rack.bottom_center_m(rack.slot(slot)) + [*off_m, 0.0]
+    origin = rack.bottom_center_m(rack.slot(slot)) + np.array([*off_m, 0.0])
     return make_transform(tilt_rotation(alpha_rad, beta_rad), origin)
 
 
@@ -45,7 +46,7 @@ def tube_surface(
     T_rack_tube: FloatArray,
     above_m: float,
     seed: int = 0,
-    spacing_m: float = SPACING_M,
+    spacing_m: float = TUBE_SPACING_M,
     noise_m: float = NOISE_M,
     seen_from: FloatArray | None = None,
 ) -> FloatArray:

@@ -48,7 +48,7 @@ ALLOWED: dict[str, set[str]] = {
         "pose_errors",
         "simulation",
     },
-    "provenance": {"config", "labware", "version"},
+    "provenance": {"capture", "config", "labware", "version"},
     "report": {
         "batch",
         "capture",

@@ -378,3 +378,12 @@ def test_seed_spread_shows_the_range_of_the_means_of_stochastic_methods_only():
     assert row["rx_deg_mean_min"] == pytest.approx(1.5, abs=0.05)
     assert row["rx_deg_mean_max"] == pytest.approx(1.6, abs=0.05)
     assert seed_spread(evaluate(table([]), TRUTH, TUBES, ["paper"])).empty
+
+
+def test_a_summary_of_nothing_keeps_its_columns():
+    estimates = table([estimate_row("a", "A1")])
+    refused = evaluate(estimates, TRUTH.assign(status="refused"), TUBES, ["paper"])
+    assert len(refused) == 0
+    judged = evaluate(estimates, TRUTH, TUBES, ["paper"])
+    assert summarise(refused, ["paper"]).columns.tolist() == summarise(judged).columns.tolist()
+    assert len(summarise(refused, ["paper"])) == 0

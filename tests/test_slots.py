@@ -29,8 +29,8 @@ def disc(center_mm, radius_mm, count=360, z_mm=100.0):
     return np.column_stack([xy, np.full(count, z_mm)]) * 1e-3
 
 
-def center_mm(name, rack=RACK):
-    return np.array(rack.slot(name).center_mm)
+def center_mm(name, rack=RACK, off=(0.0, 0.0)):
+    return np.array(rack.slot(name).center_mm) + np.array(off)
 
 
 @pytest.mark.parametrize(
@@ -43,7 +43,7 @@ def center_mm(name, rack=RACK):
     ids=["inside", "on-an-edge", "around"],
 )
 def test_share_of_a_disc_over_a_square_slot(offset_mm, radius_mm, share):
-    shares = slot_shares(disc(center_mm("C5") + offset_mm, radius_mm), RACK)
+    shares = slot_shares(disc(center_mm("C5", off=offset_mm), radius_mm), RACK)
     assert shares[NAMES.index("C5")] == pytest.approx(share, rel=2e-3)
     if radius_mm < 10:
         assert np.count_nonzero(shares) == 1
@@ -63,8 +63,8 @@ def test_share_of_a_disc_over_a_round_slot():
 
 
 def test_points_inside_the_hull_and_their_height_change_no_share():
-    outline = disc(center_mm("B2") + [6, 3], 7.0)
-    filled = np.vstack([disc(center_mm("B2") + [6, 3], 3.0, z_mm=70.0), outline + [0, 0, 0.02]])
+    outline = disc(center_mm("B2", off=(6, 3)), 7.0)
+    filled = np.vstack([disc(center_mm("B2", off=(6, 3)), 3.0, z_mm=70.0), outline + np.array([0, 0, 0.02])])
     assert np.allclose(slot_shares(filled, RACK), slot_shares(outline, RACK), atol=1e-9)
 
 
@@ -98,7 +98,7 @@ def test_no_tubes_no_slots():
 
 
 def test_two_tubes_on_one_slot_the_larger_share_keeps_it():
-    shifted, centred = disc(center_mm("B3") + [1.5, 0], 8.0), disc(center_mm("B3"), 8.0)
+    shifted, centred = disc(center_mm("B3", off=(1.5, 0)), 8.0), disc(center_mm("B3"), 8.0)
     loser, winner = assign_slots([shifted, centred], RACK, CONFIG)
     assert (winner.slot, winner.reason) == ("B3", "")
     assert loser.slot is None
@@ -107,7 +107,7 @@ def test_two_tubes_on_one_slot_the_larger_share_keeps_it():
 
 
 def test_the_one_that_must_go_takes_its_next_best_free_slot():
-    centred, between = disc(center_mm("B3"), 8.0), disc(center_mm("B3") + [8.0, 0], 8.0)
+    centred, between = disc(center_mm("B3"), 8.0), disc(center_mm("B3", off=(8.0, 0)), 8.0)
     winner, other = assign_slots([centred, between], RACK, CONFIG)
     assert winner.slot == "B3"
     assert (other.slot, other.reason) == ("B4", "")
@@ -115,7 +115,7 @@ def test_the_one_that_must_go_takes_its_next_best_free_slot():
 
 
 def test_the_slots_do_not_depend_on_the_order_of_the_tubes():
-    tubes = [disc(center_mm("B3") + [k, 0], 8.0) for k in (0, 1.5, 8.0)]
+    tubes = [disc(center_mm("B3", off=(k, 0)), 8.0) for k in (0, 1.5, 8.0)]
     forth = [entry.slot for entry in assign_slots(tubes, RACK, CONFIG)]
     back = [entry.slot for entry in assign_slots(tubes[::-1], RACK, CONFIG)]
     assert forth == back[::-1] == ["B3", None, "B4"]

@@ -66,13 +66,19 @@ class Tables:
     problems: list[str] = field(default_factory=list)
 
 
-def session_jobs(session: Session) -> tuple[list[Job], list[str]]:
-    """One job per trial, on the capture with the original caps; and one line per trial whose capture is not there."""
+def session_jobs(session: Session, *, fail_fast: bool = False) -> tuple[list[Job], list[str]]:
+    """One job per trial, on the capture with the original caps; and one line per trial whose capture is not there.
+
+    Raises:
+        CaptureError: A capture is not there, and `fail_fast` is set.
+    """
     jobs, problems = [], []
     for trial in session.trials:
         try:
             capture = trial_capture(session, trial, trial.original)
         except CaptureError as problem:
+            if fail_fast:
+                raise
             problems.append(str(problem))
             continue
         jobs.append(Job(capture, session.rack, session.tubes_of(trial), trial.hint, session.name, trial.name))

@@ -181,11 +181,12 @@ def summarise(errors: pd.DataFrame, methods: Sequence[str] | None = None) -> pd.
         Rows of summary.csv; tubes in sorted order. False estimates count for the tube that they claim to be.
     """
     tubes = errors["tube"].fillna("unknown")
+    columns = list(_summary_row("", "", errors.iloc[:0]))
     rows = []
     for method in methods if methods is not None else errors["method"].unique():
         for tube in sorted(tubes.unique()):
             rows.append(_summary_row(str(method), tube, errors[(errors["method"] == method) & (tubes == tube)]))
-    return pd.DataFrame(rows)
+    return pd.DataFrame(rows, columns=columns)
 
 
 def _summary_row(method: str, tube: str, rows: pd.DataFrame) -> dict[str, Any]:

@@ -19,6 +19,7 @@ Rows = NDArray[np.intp]
 TALLEST_TUBE_M = 0.15
 OUTLINE_OF_INTEREST_M = 0.02
 PATCH_RADIUS_M = 0.03
+PATCH_HALF_HEIGHT_M = 0.01
 UNIT_FACTORS = (10.0, 0.1, 1000.0, 0.001)
 
 
@@ -130,25 +131,31 @@ def _measure_again(points_m: FloatArray, coarse: RackTop, rack: RackModel, confi
 
 
 def level_noise_m(points_m: FloatArray, config: RackTopConfig) -> float:
-    """How far depth scatters on what should be flat, metres: median rms of patches about their own planes.
+    """How far depth scatters on what should be flat, metres: median over patches of the scatter about their planes.
 
     The patches lie on the first level plane. Smooth waves, as stereo cameras make them, count: a patch is wide enough
-    to hold a slot and its ribs. NaN where no patch has enough points.
+    to hold a slot and its ribs. Tubes that stand in it do not. NaN where no patch has enough points.
     """
     sample = thin(points_m, config.search_points)
     plane = next(_level_planes(sample, config), None)
     if plane is None:
         return float("nan")
     normal, origin = plane
-    level = sample[np.abs((sample - origin) @ normal) < 3 * PATCH_RADIUS_M / 4]
+    level = sample[np.abs((sample - origin) @ normal) < PATCH_HALF_HEIGHT_M]
     near = cKDTree(level)
     patches = [near.query_ball_point(center, PATCH_RADIUS_M) for center in thin(level, 100)]
-    rms = [_plane_rms(level[patch]) for patch in patches if len(patch) >= 30]
-    return float(np.median(rms)) if rms else float("nan")
+    scatter = [_plane_scatter(level[patch]) for patch in patches if len(patch) >= 30]
+    return float(np.median(scatter)) if scatter else float("nan")
 
 
-def _plane_rms(points_m: FloatArray) -> float:
-    return float(np.sqrt(max(np.linalg.eigvalsh(np.cov(points_m.T))[0], 0.0)))
+def _plane_scatter(points_m: FloatArray) -> float:
+    """Standard deviation about a plane, from the median deviation: walls of tubes must not count."""
+    kept = points_m
+    for _ in range(4):
+        normal, origin = _fit_plane(kept)
+        off = np.abs((points_m - origin) @ normal)
+        kept = points_m[off <= np.percentile(off, 70)]
+    return float(1.4826 * np.median(off))
 
 
 def plausible_unit_factors(points_m: FloatArray, rack: RackModel) -> tuple[float, ...]:

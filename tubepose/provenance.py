@@ -16,6 +16,7 @@ import open3d as o3d
 from threadpoolctl import threadpool_limits
 
 from tubepose import __version__
+from tubepose.capture.manifest import file_sha256, tree_sha256
 from tubepose.config import Config
 from tubepose.labware import CapModel, RackModel, TubeModel
 
@@ -41,13 +42,8 @@ def pinned_threads(count: int = 1) -> Iterator[None]:
 
 
 def sha256_of(path: Path) -> str:
-    """SHA-256 of a file; of a folder, of its files' relative names and contents in sorted order."""
-    digest = hashlib.sha256()
-    for file in [path] if path.is_file() else sorted(p for p in path.rglob("*") if p.is_file()):
-        if file != path:
-            digest.update(file.relative_to(path).as_posix().encode() + b"\0")
-        digest.update(hashlib.sha256(file.read_bytes()).digest())
-    return digest.hexdigest()
+    """SHA-256 of a file; of a folder, of the listing of its files, as in `data_manifest.yaml`."""
+    return file_sha256(path) if path.is_file() else tree_sha256(path)
 
 
 def labware_sha256(item: RackModel | TubeModel | CapModel) -> str:

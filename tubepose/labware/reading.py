@@ -114,7 +114,7 @@ def _load(name_or_file: str, model: type[_L], kind: str, folder: Path | None) ->
         return item
     close = difflib.get_close_matches(name_or_file, known, n=1)
     guess = f"; did you mean '{close[0]}'?" if close else ""
-    raise LabwareError(f"unknown {kind} '{name_or_file}'{guess} Known: {', '.join(known)}; or give a .yaml file")
+    raise LabwareError(f"unknown {kind} '{name_or_file}'{guess}; known: {', '.join(known)}; or give a .yaml file")
 
 
 def load_rack(name_or_file: str, folder: Path | None = None) -> RackModel:

@@ -19,6 +19,20 @@ from tubepose.errors import ConfigError
 from tubepose.report.tables import Table
 
 
+def make_folder(path: Path) -> None:
+    """Make a folder for results before any work is done.
+
+    Raises:
+        ConfigError: It cannot be made.
+    """
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+    except OSError as problem:
+        raise ConfigError(
+            f"{path}: cannot be a folder for results ({problem.strerror}); choose another place"
+        ) from None
+
+
 @contextmanager
 def write_aside(path: Path) -> Iterator[Path]:
     """Give a path beside `path` to write to, and rename it to `path` when the block ends well.

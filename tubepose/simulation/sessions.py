@@ -115,7 +115,8 @@ def simulate_session(
         entries = []
         for done, plan in enumerate(plans):
             entries.append(_simulate_trial(aside, plan, settings, progress, 2 * done, 2 * len(plans)))
-        _write_session(aside, out.name, settings, entries)
+        # Not named after the folder: the same seed gives the same bytes anywhere.
+        _write_session(aside, f"{sensor}-{rack.name}-{resolution}-seed{seed}", settings, entries)
         if out.exists():
             out.rmdir()
         aside.rename(out)

@@ -1,0 +1,23 @@
+"""What several test files share: one small simulated session per run."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from commands import tubepose
+
+SMALL_RACK = "round-10ml-3x4"
+SMALL_TUBES = ("blood-16x100", "chen2023-tube-3")
+
+
+@pytest.fixture(scope="session")
+def small_session(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Two trials in a rack with wide ribs, at about the coarsest resolution at which it and the caps are found."""
+    out = tmp_path_factory.mktemp("small") / "session"
+    ended = tubepose(
+        "simulate", out, "--rack", SMALL_RACK, "--tubes", ",".join(SMALL_TUBES), "--trials", "1", "--seed", "3",
+        "--resolution", "400", "--fill", "0.2",
+    )  # fmt: skip
+    assert (ended.code, ended.out) == (0, ""), ended.err
+    return out

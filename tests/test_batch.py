@@ -1,0 +1,199 @@
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import scenes
+
+from tubepose.batch import Job, Tables, run_jobs, session_jobs, trial_capture
+from tubepose.capture.frame import RgbdFrame
+from tubepose.capture.session import Session, load_session
+from tubepose.config import Config
+from tubepose.detection.geometric import GeometricDetector
+from tubepose.errors import CaptureError, DetectorError
+from tubepose.labware import load_rack, load_tube
+from tubepose.records import ESTIMATE_COLUMNS, RACK_COLUMNS, SLOT_COLUMNS, TIMING_COLUMNS, to_table
+from tubepose.transforms import transform_points
+
+CONFIG = Config()
+RACK = load_rack("round-10ml-3x4")
+TUBE = load_tube("blood-16x100")
+T_CAMERA_RACK = scenes.camera_from_rack(RACK, 0.3, 0.15)
+
+
+def make_frame(name: str, slots: tuple[str, ...] = ("B2",), index: int = 0, scale: float = 1.0) -> RgbdFrame:
+    view = scenes.towards_camera(T_CAMERA_RACK)
+    surfaces = [
+        scenes.tube_surface(TUBE, scenes.tube_pose(RACK, slot, 0.01, 0.01), RACK.height_m, seed=i, seen_from=view)
+        for i, slot in enumerate(slots)
+    ]
+    points = transform_points(T_CAMERA_RACK, np.vstack([scenes.rack_top(RACK, spacing_m=1.2e-3), *surfaces]))
+    return replace(scenes.unorganised(points * scale), capture=name, index=index)
+
+
+@dataclass(frozen=True)
+class Recorded:
+    """A capture of frames in memory that ends with a problem, if it has one."""
+
+    name: str
+    content: tuple[RgbdFrame, ...] = ()
+    problem: Exception | None = None
+    path: Path = Path("captures/scan")
+
+    def frames(self) -> Iterator[RgbdFrame]:
+        yield from self.content
+        if self.problem is not None:
+            raise self.problem
+
+
+def job(name: str, *frames: RgbdFrame, problem: Exception | None = None, **more: Any) -> Job:
+    return Job(Recorded(name, frames, problem), RACK, (TUBE,), **more)
+
+
+def run(*jobs: Job, methods: tuple[str, ...] = ("upright",), **options: Any) -> Tables:
+    return run_jobs(jobs, methods, lambda rack, tubes: GeometricDetector(rack, tubes, CONFIG), CONFIG, **options)
+
+
+GOOD = make_frame("good")
+
+
+def test_a_bad_capture_stops_neither_the_ones_before_nor_the_ones_after() -> None:
+    done: list[int] = []
+    broken = job("broken", replace(GOOD, capture="broken"), problem=CaptureError("cut after 1 frame"))
+    nothing = job("nothing", problem=CaptureError("captures/scan: no such file"))
+    tables = run(job("good", GOOD), broken, nothing, job("good", GOOD), on_done=lambda: done.append(1))
+    assert [row["capture"] for row in tables.racks] == ["good", "broken", "good"]
+    assert tables.problems == ["broken: cut after 1 frame", "captures/scan: no such file"]
+    assert len(done) == 4
+
+
+def test_a_detector_that_cannot_work_is_a_problem_of_its_capture() -> None:
+    class Blind:
+        name = "blind"
+
+        def detect(self, frame: RgbdFrame) -> Any:
+            raise DetectorError("no image")
+
+    tables = run_jobs([job("a", GOOD), job("b", GOOD)], ["upright"], lambda rack, tubes: Blind(), CONFIG, warm_up=True)
+    assert tables.problems == ["a: no image", "b: no image"]
+    assert tables.racks == []
+
+
+def test_fail_fast_raises_the_first_problem() -> None:
+    with pytest.raises(CaptureError, match="cut"):
+        run(job("good", GOOD), job("bad", problem=CaptureError("cut")), fail_fast=True)
+
+
+def test_our_own_bugs_are_not_kept_as_problems() -> None:
+    with pytest.raises(ZeroDivisionError):
+        run(job("bug", problem=ZeroDivisionError()))
+
+
+def test_only_stochastic_methods_run_once_per_seed() -> None:
+    tables = run(job("good", GOOD), methods=("upright", "global-icp"), seeds=3)
+    rows = [(row["method"], row["seed"]) for row in tables.estimates]
+    assert rows == [("upright", None), *(("global-icp", seed) for seed in range(3))]
+    assert [row["method"] for row in tables.racks] == ["upright", "global-icp"]
+    assert len(tables.slots) == 2 * len(RACK.all_slots)
+
+
+def test_warm_up_runs_the_first_frame_once_more_and_marks_its_times_only() -> None:
+    cold, warm = (run(job("good", GOOD), job("good", GOOD), warm_up=wanted) for wanted in (False, True))
+    assert (len(warm.racks), len(warm.estimates)) == (len(cold.racks), len(cold.estimates)) == (2, 2)
+    marked = [row["stage"] for row in warm.timings if row["warmup"]]
+    assert marked == ["detect", "rack", "slots", "tube"]
+    assert [row["stage"] for row in warm.timings if not row["warmup"]] == ["load", *marked] * 2
+    assert not any(row["warmup"] for row in cold.timings)
+
+
+def test_a_wrong_unit_is_a_row_and_a_problem() -> None:
+    tables = run(job("mm", make_frame("mm", scale=1000.0)), job("good", GOOD))
+    assert [row["status"] for row in tables.racks] == ["wrong_unit", "ok"]
+    assert len(tables.problems) == 1
+    assert tables.problems[0].startswith("mm: ")
+    assert "unit" in tables.problems[0]
+
+
+def test_a_given_rack_is_not_registered() -> None:
+    tables = run(job("good", GOOD, T_camera_rack=T_CAMERA_RACK))
+    assert tables.racks[0]["resolved_by"] == "given"
+    assert "rack" not in {row["stage"] for row in tables.timings}
+    assert [row["slot"] for row in tables.estimates] == ["B2"]
+
+
+def test_every_frame_of_a_recording_has_its_rows() -> None:
+    frames = [make_frame("film", slots, index=i) for i, slots in enumerate([("B2",), ("A1", "C4")])]
+    tables = run(job("film", *frames, T_camera_rack=T_CAMERA_RACK, session="s", trial="t"))
+    found = [(row["session"], row["trial"], row["frame"], row["slot"]) for row in tables.estimates]
+    assert found == [("s", "t", 0, "B2"), ("s", "t", 1, "A1"), ("s", "t", 1, "C4")]
+    occupied = [(row["frame"], row["slot"]) for row in tables.slots if row["occupied"]]
+    assert occupied == [(0, "B2"), (1, "A1"), (1, "C4")]
+
+
+def test_pictures_show_the_papers_method_if_it_ran() -> None:
+    seen: list[str] = []
+
+    def keep(job: Job, scene: Any, estimates: Any) -> None:
+        seen.extend(estimate.method for estimate in estimates)
+
+    run(job("good", GOOD), methods=("upright", "paper"), on_scene=keep)
+    run(job("good", GOOD), methods=("upright", "slot-icp"), on_scene=keep)
+    assert seen == ["paper", "upright"]
+
+
+def test_the_rows_fit_the_columns() -> None:
+    tables = run(job("good", GOOD), methods=("paper",))
+    for rows, columns in (
+        (tables.racks, RACK_COLUMNS),
+        (tables.slots, SLOT_COLUMNS),
+        (tables.estimates, ESTIMATE_COLUMNS),
+        (tables.timings, TIMING_COLUMNS),
+    ):
+        assert rows
+        assert all(set(row) <= set(columns) for row in rows)
+        assert list(to_table(rows, columns).columns) == list(columns)
+        assert list(to_table([], columns).columns) == list(columns)
+
+
+# Sessions
+
+
+@pytest.fixture
+def session(tmp_path: Path) -> Session:
+    (tmp_path / "session.yaml").write_text(
+        "format: 1\nname: s\norigin: recorded\nrack: round-10ml-3x4\ntrials:\n"
+        "- {name: one, tubes: {A1: blood-16x100, B1: blood-16x100}, original: scan-1}\n"
+        "- {name: two, tubes: {A1: centrifuge-10ml, C3: blood-16x100}, original: scan-2,"
+        " hint: {slot: A1, pixel: [5, 6]}}\n"
+        "- {name: three, tubes: {}, original: folder}\n"
+    )
+    for name in ("scan-2", "folder/a", "folder/b"):
+        (tmp_path / name).mkdir(parents=True)
+        (tmp_path / name / "cloud.ply").write_text("")
+    return load_session(tmp_path)
+
+
+def test_a_session_gives_one_job_per_trial_and_one_line_per_trial_that_has_none(session: Session) -> None:
+    jobs, problems = session_jobs(session)
+    assert [(job.session, job.trial, job.capture.name) for job in jobs] == [("s", "two", "scan-2")]
+    assert [tube.name for tube in jobs[0].tubes] == ["blood-16x100", "centrifuge-10ml"]
+    assert jobs[0].hint is not None
+    assert jobs[0].hint.pixel == (5, 6)
+    assert len(problems) == 2
+    assert "scan-1: no such file or folder" in problems[0]
+    assert "folder: trial three needs one capture, found 2" in problems[1]
+
+
+def test_fail_fast_raises_at_the_first_trial_without_its_capture(session: Session) -> None:
+    with pytest.raises(CaptureError, match="scan-1: no such file or folder"):
+        session_jobs(session, fail_fast=True)
+
+
+def test_a_trial_names_one_capture(session: Session) -> None:
+    assert trial_capture(session, session.trials[1], "scan-2").name == "scan-2"
+    with pytest.raises(CaptureError, match="trial two needs one capture, found 2"):
+        trial_capture(session, session.trials[1], "folder")

@@ -1,0 +1,596 @@
+"""The commands where things go wrong, and what stands in the files when they do not."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import re
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import numpy as np
+import onnx
+import pandas as pd
+import pytest
+import yaml
+from commands import Ended, tubepose
+from conftest import SMALL_RACK, SMALL_TUBES
+from onnx import TensorProto, helper, numpy_helper
+
+from tubepose.capture.mcap_writing import write_mcap
+from tubepose.capture.source import open_captures
+from tubepose.config import Config
+from tubepose.detection.box_writing import write_yolo_txt
+from tubepose.detection.geometric import GeometricDetector
+from tubepose.evaluation import AXES
+from tubepose.labware import load_rack, load_tube
+from tubepose.records import ESTIMATE_COLUMNS, POSE_COLUMNS, RACK_COLUMNS, SLOT_COLUMNS, TIMING_COLUMNS
+from tubepose.transforms import FloatArray
+
+KNOWN = ("--rack", SMALL_RACK, "--tubes", SMALL_TUBES[1])
+DOCS = Path(__file__).parents[1] / "docs" / "outputs.md"
+
+
+NET = 416
+
+
+def digests(folder: Path) -> dict[str, str]:
+    """Every file below a folder, hidden ones too."""
+    files = sorted(path for path in folder.rglob("*") if path.is_file())
+    return {path.relative_to(folder).as_posix(): hashlib.sha256(path.read_bytes()).hexdigest() for path in files}
+
+
+def table(path: Path) -> pd.DataFrame:
+    return pd.read_csv(path, keep_default_na=False)
+
+
+def columns(path: Path) -> list[str]:
+    return path.read_text().split("\n", 1)[0].split(",")
+
+
+def original(session: Path, tube: str = SMALL_TUBES[1]) -> Path:
+    return session / "captures" / f"{tube}-001-original"
+
+
+def edited(session: Path, to: Path, edit: Callable[[str], str]) -> Path:
+    """A copy of a session with another `session.yaml`."""
+    shutil.copytree(session, to)
+    (to / "session.yaml").write_text(edit((to / "session.yaml").read_text()))
+    return to
+
+
+def one_error(ended: Ended, *words: str) -> None:
+    """Exit 1 with one line that holds all the words."""
+    assert (ended.code, ended.out, "Traceback" in ended.err) == (1, "", False)
+    (line,) = ended.errors
+    assert all(word in line for word in words), line
+
+
+# What is written
+
+
+@pytest.fixture(scope="module")
+def estimated(small_session: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Ended]:
+    out = tmp_path_factory.mktemp("estimate") / "out"
+    before = digests(small_session)
+    ended = tubepose("estimate", small_session, "--out", out, "--method", "paper,upright")
+    assert digests(small_session) == before
+    return out, ended
+
+
+@pytest.fixture(scope="module")
+def benched(small_session: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Ended]:
+    out = tmp_path_factory.mktemp("bench") / "out"
+    return out, tubepose("bench", small_session, "--out", out, "--methods", "upright,paper,global-icp", "--seeds", "1")
+
+
+def test_estimate_writes_these_files_and_no_others(estimated: tuple[Path, Ended]) -> None:
+    out, ended = estimated
+    assert (ended.code, ended.out, ended.errors) == (0, "", [])
+    session = table(out / "racks.csv")["session"][0]
+    pictures = {f"{session}-{tube}-001-original-0000.png" for tube in SMALL_TUBES}
+    assert {path.name for path in (out / "overlays").iterdir()} == pictures
+    files = {"racks.csv", "slots.csv", "estimates.csv", "timings.csv", "run.json", "overlays"}
+    assert {path.name for path in out.iterdir()} == files
+    assert {path.name for path in out.parent.iterdir()} == {"out"}
+
+
+def test_estimate_writes_exactly_these_columns(estimated: tuple[Path, Ended]) -> None:
+    out, _ = estimated
+    assert columns(out / "racks.csv") == list(RACK_COLUMNS)
+    assert columns(out / "slots.csv") == list(SLOT_COLUMNS)
+    assert columns(out / "estimates.csv") == list(ESTIMATE_COLUMNS)
+    assert columns(out / "timings.csv") == list(TIMING_COLUMNS)
+
+
+def test_every_slot_is_listed_and_the_filled_ones_are_the_declared(
+    estimated: tuple[Path, Ended], small_session: Path
+) -> None:
+    slots = table(estimated[0] / "slots.csv")
+    assert len(slots) == 2 * 2 * 12
+    declared = {
+        (trial["name"], slot, tube)
+        for trial in yaml.safe_load((small_session / "session.yaml").read_text())["trials"]
+        for slot, tube in trial["tubes"].items()
+    }
+    held = slots[(slots["method"] == "paper") & (slots["occupied"].astype(str) == "True")]
+    assert set(held[["trial", "slot", "tube"]].itertuples(index=False, name=None)) == declared
+    empty = slots[slots["occupied"].astype(str) == "False"]
+    assert set(empty["tube"]) == {""}
+    assert set(empty["n_points"]) == {0}
+
+
+def test_poses_have_unit_quaternions_and_stamps_all_digits(estimated: tuple[Path, Ended], small_session: Path) -> None:
+    estimates = table(estimated[0] / "estimates.csv")
+    quaternions = estimates[list(POSE_COLUMNS[3:])].to_numpy(float)
+    assert np.linalg.norm(quaternions, axis=1) == pytest.approx(1)
+    assert (quaternions[:, 0] >= 0).all()
+    stamps = {
+        yaml.safe_load((original(small_session, tube) / "capture.yaml").read_text())["timestamp_ns"]
+        for tube in SMALL_TUBES
+    }
+    assert set(estimates["timestamp_ns"]) == stamps
+    assert all(len(str(stamp)) == 19 for stamp in stamps)
+
+
+def test_pictures_open_and_are_not_blank(estimated: tuple[Path, Ended]) -> None:
+    for path in (estimated[0] / "overlays").iterdir():
+        picture = cv2.imread(str(path))
+        assert picture is not None
+        assert picture.shape[1] >= 800
+        assert picture.std() > 10
+
+
+def test_the_run_record_has_what_the_page_says(
+    estimated: tuple[Path, Ended], benched: tuple[Path, Ended], small_session: Path
+) -> None:
+    section = sections()["run.json"]
+    keys = set(re.findall(r"`(\w+)`", " ".join(re.findall(r"^\|(.+?)\|", section, re.MULTILINE)))) - {"key"}
+    for out, _ in (estimated, benched):
+        record = json.loads((out / "run.json").read_text())
+        assert keys <= set(record)
+        assert record["command"][0] == "tubepose"
+        assert record["problems"] == []
+        assert {SMALL_RACK, *SMALL_TUBES} == set(record["labware_sha256"])
+        assert str(small_session) in record["inputs_sha256"]
+        digests_found = [*record["labware_sha256"].values(), *record["inputs_sha256"].values()]
+        assert all(re.fullmatch("[0-9a-f]{64}", digest) for digest in digests_found)
+        assert {"python", "numpy", "scipy", "pandas"} <= set(record["versions"])
+
+
+def test_a_second_run_into_the_same_folder_gives_the_same_bytes(
+    estimated: tuple[Path, Ended], small_session: Path, tmp_path: Path
+) -> None:
+    out = Path(shutil.copytree(estimated[0], tmp_path / "out"))
+    (out / "racks.csv").write_text("an old table\n")
+    assert tubepose("estimate", small_session, "--out", out, "--method", "paper,upright").code == 0
+    first, second = digests(estimated[0]), digests(out)
+    changed = {name for name in first if first[name] != second.get(name)}
+    assert set(first) == set(second)
+    assert changed <= {"timings.csv", "run.json"}
+
+
+def test_bench_prints_both_tables_on_stdout_and_talks_on_stderr(benched: tuple[Path, Ended]) -> None:
+    out, ended = benched
+    assert ended.code == 0
+    assert ended.out.index("Rotational and translational errors") < ended.out.index("Time costs")
+    assert "SIMULATED" in ended.out
+    assert "[Open3D" not in ended.out + ended.err
+    assert ended.err.splitlines() == [f"all tables and rows: {out}"]
+    assert not [name for name in digests(out) if "/." in f"/{name}"]
+    for name in ("table_accuracy", "table_timing"):
+        assert r"\end{table}" in (out / f"{name}.tex").read_text()
+        assert "| ---" in (out / f"{name}.md").read_text()
+
+
+def test_counts_add_up(benched: tuple[Path, Ended], small_session: Path) -> None:
+    out, _ = benched
+    summary, errors = table(out / "summary.csv"), table(out / "errors.csv")
+    parts = ["n_ok", "n_rejected", "n_missed", "n_failed"]
+    assert (summary["n_expected"] == summary[parts].sum(axis=1)).all()
+    assert summary["n_expected"].sum() == (errors["outcome"] != "false").sum()
+    assert list(summary["method"].unique()) == ["upright", "paper", "global-icp"]
+    assert set(summary.loc[summary["method"] == "upright", "tube"]) == set(SMALL_TUBES)
+    accuracy = table(out / "table_accuracy.csv")
+    assert accuracy["n_ok"].sum() == summary["n_ok"].sum()
+
+
+# The page about the files
+
+
+def sections() -> dict[str, str]:
+    parts = DOCS.read_text(encoding="utf-8").split("\n## ")[1:]
+    return {part.split("\n", 1)[0].strip(): part for part in parts}
+
+
+def documented(name: str) -> set[str]:
+    """Columns that docs/outputs.md gives a file: those of its keys, and those of its table."""
+    text = sections()[f"{name}.csv"]
+    keys = re.search(r"(?:Keys:|columns are) (.+?)(?:\.|, and:)", text, re.DOTALL)
+    told = set(re.findall(r"\w+", re.sub(r"\(.*?\)", "", keys.group(1), flags=re.DOTALL))) if keys else set()
+    for cell in re.findall(r"^\|(.+?)\|", text, re.MULTILINE):
+        if "`tx_m` ... `qz`" in cell:
+            told |= set(POSE_COLUMNS)
+        else:
+            told |= set(re.findall(r"`([^`]+)`", cell))
+    generic = {column for column in told if column.startswith("X_")}
+    outcomes = {"ok", "rejected", "missed", "failed", "false"}
+    return (told - generic - outcomes) | {axis + column[1:] for column in generic for axis in AXES}
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "racks", "slots", "estimates", "timings", "ground_truth", "errors", "summary", "comparison", "seeds",
+        "slot_accuracy",
+    ],
+)  # fmt: skip
+def test_the_page_and_the_file_have_the_same_columns(name: str, benched: tuple[Path, Ended]) -> None:
+    assert documented(name) == set(columns(benched[0] / f"{name}.csv"))
+
+
+def test_the_page_and_the_tables_have_the_same_columns(benched: tuple[Path, Ended]) -> None:
+    assert documented_words("table_accuracy") == set(columns(benched[0] / "table_accuracy.csv"))
+    cells = " ".join(re.findall(r"^\|(.+?)\|", sections()["table_timing"], re.MULTILINE))
+    assert set(re.findall(r"`(\w+)`", cells)) == set(columns(benched[0] / "table_timing.csv"))
+    floor = sections()["ground_truth.csv"].split("`ground_truth_floor.csv`")[1]
+    words = set(re.findall(r"\w+", floor.split("Columns ")[1].split(" as in ")[0])) - {"and"}
+    assert words == set(columns(benched[0] / "ground_truth_floor.csv"))
+
+
+def documented_words(name: str) -> set[str]:
+    text = sections()[name].split("CSV columns:")[1].split(": `measured`")[0]
+    quoted = re.findall(r"`([^`]+)`", text)
+    return {word for words in quoted for word in words.split() if not word.endswith(".csv")}
+
+
+def test_the_page_lists_every_file(benched: tuple[Path, Ended]) -> None:
+    page = DOCS.read_text(encoding="utf-8").split("\n## ")[0]
+    for path in benched[0].iterdir():
+        stem = path.name if not path.name.startswith("table_") else f"`{path.stem}.csv .md .tex`"
+        assert stem in page
+
+
+# One line each, and the rest is done
+
+
+def write_ply(path: Path, points: FloatArray) -> None:
+    head = f"ply\nformat binary_little_endian 1.0\nelement vertex {len(points)}\n"
+    head += "".join(f"property float {axis}\n" for axis in "xyz") + "end_header\n"
+    path.write_bytes(head.encode() + points.astype("<f4").tobytes())
+
+
+@pytest.fixture(scope="module")
+def damaged(small_session: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with a good capture first, then a cut, an incomplete and several contradictory ones, then a good one."""
+    folder = tmp_path_factory.mktemp("damaged") / "captures"
+    shutil.copytree(original(small_session), folder / "a-good")
+    frame = next(open_captures(original(small_session))[0].frames())
+    points = np.nan_to_num(frame.points_m)
+    write_mcap(folder / "b-cut.mcap", [frame])
+    content = (folder / "b-cut.mcap").read_bytes()
+    (folder / "b-cut.mcap").write_bytes(content[: len(content) // 2])
+    contents = {
+        "c-missing": "unit: m\ncloud: scan.ply\n",
+        "d-mm-as-m": "unit: m\n",
+        "e-m-as-mm": "unit: mm\n",
+        "f-key": "unit: m\nuntis: mm\n",
+        "g-size": "unit: m\ncloud_width: 400\ncloud_height: 400\n",
+        "h-cut-cloud": "unit: m\n",
+    }
+    for name, text in contents.items():
+        (folder / name).mkdir()
+        (folder / name / "capture.yaml").write_text(text)
+        if name != "c-missing":
+            step = 3 if name in ("d-mm-as-m", "e-m-as-mm") else 1
+            write_ply(folder / name / "cloud.ply", points[::step] * (1000 if name == "d-mm-as-m" else 1))
+    cv2.imwrite(str(folder / "g-size" / "image.png"), np.zeros((300, 300), np.uint8))
+    whole = (folder / "h-cut-cloud" / "cloud.ply").read_bytes()
+    (folder / "h-cut-cloud" / "cloud.ply").write_bytes(whole[: len(whole) // 2])
+    (folder / "i-frame.zdf").write_bytes(b"")
+    (folder / "notes.txt").write_text("nothing of a capture")
+    shutil.copytree(original(small_session), folder / "z-good")
+    return folder
+
+
+def test_a_batch_with_bad_captures_names_each_in_one_line_and_does_the_good(damaged: Path, tmp_path: Path) -> None:
+    ended = tubepose("estimate", damaged, *KNOWN, "--method", "upright", "--no-overlays", "--out", tmp_path / "out")
+    assert (ended.code, ended.out, "Traceback" in ended.err) == (1, "", False)
+    wanted = (
+        ("b-cut.mcap", "truncated after 0 whole frame", "record it again"),
+        ("c-missing/scan.ply", "no such file"),
+        ("d-mm-as-m", "1000 times larger", "unit"),
+        ("e-m-as-mm", "1000 times smaller", "unit"),
+        ("f-key/capture.yaml", "unknown key 'untis'", "known keys: unit"),
+        ("g-size", "300 x 300", "400 x 400"),
+        ("h-cut-cloud/cloud.ply", "truncated", "160000"),
+        ("i-frame.zdf", "Zivid", "save it as PLY"),
+    )
+    assert len(ended.errors) == len(wanted)
+    for line, words in zip(ended.errors, wanted, strict=True):
+        assert all(word in line for word in words), line
+    racks = table(tmp_path / "out" / "racks.csv").set_index("capture")["status"].to_dict()
+    assert racks == {"a-good": "ok", "d-mm-as-m": "wrong_unit", "e-m-as-mm": "wrong_unit", "z-good": "ok"}
+    assert (table(tmp_path / "out" / "estimates.csv")["status"] == "ok").sum() == 4
+    record = json.loads((tmp_path / "out" / "run.json").read_text())
+    assert [f"error: {line}" for line in record["problems"]] == ended.errors
+    assert not [name for name in digests(tmp_path) if "/." in f"/{name}"]
+
+
+def test_fail_fast_ends_with_the_first_bad_capture(damaged: Path, tmp_path: Path) -> None:
+    ended = tubepose("estimate", damaged, *KNOWN, "--no-overlays", "--fail-fast", "--out", tmp_path / "out")
+    one_error(ended, "b-cut.mcap: truncated")
+    assert digests(tmp_path) == {}
+
+
+@pytest.mark.parametrize("command", ["estimate", "bench"])
+def test_fail_fast_ends_with_a_trial_without_its_capture(command: str, small_session: Path, tmp_path: Path) -> None:
+    session = edited(small_session, tmp_path / "s", lambda text: re.sub("  printed: .*\n", "", text))
+    shutil.rmtree(original(session, SMALL_TUBES[0]))
+    one_error(tubepose(command, session, "--fail-fast", "--out", tmp_path / "out"), "no such file or folder")
+    assert not (tmp_path / "out" / "racks.csv").exists()
+
+
+def test_a_session_that_cannot_be_read_does_not_stop_the_next(small_session: Path, tmp_path: Path) -> None:
+    def unprinted(text: str) -> str:
+        return re.sub("  printed: .*\n", "", text)
+
+    good = edited(small_session, tmp_path / "good", lambda text: unprinted(text).replace("name: ray", "name: good-ray"))
+    key = edited(small_session, tmp_path / "key", lambda text: text + "notes: none\n")
+    tube = edited(small_session, tmp_path / "tube", lambda text: re.sub(r": blood-16x100\b(?=[,}])", ": nope", text))
+    rack = edited(
+        small_session, tmp_path / "rack", lambda text: text.replace(SMALL_RACK + "\nprinted", "r.yaml\nprinted")
+    )
+    (rack / "r.yaml").write_text("kind: rack\nname: r\noutlin_mm: [100, 50]\n")
+    gone = tmp_path / "gone"
+    ended = tubepose("bench", key, tube, rack, gone, good, "--methods", "upright", "--out", tmp_path / "out")
+    assert (ended.code, ended.out) == (1, "")
+    wanted = (
+        "gone: no such file or folder",
+        "unknown key 'notes'; known keys: format, name",
+        "unknown tube 'nope'; known: blood-13x100",
+        "unknown key 'outlin_mm'; known keys: kind, name",
+    )
+    assert len(ended.errors) == len(wanted)
+    for line, words in zip(ended.errors, wanted, strict=True):
+        assert words in line
+    assert "no trial has a capture with printed caps" in ended.err
+    assert list(table(tmp_path / "out" / "racks.csv")["status"]) == ["ok", "ok"]
+    assert len(json.loads((tmp_path / "out" / "run.json").read_text())["problems"]) == 4
+
+
+def test_captures_of_one_name_are_not_mixed_up(small_session: Path, tmp_path: Path) -> None:
+    for place in "ab":
+        shutil.copytree(original(small_session), tmp_path / place / "scan")
+    paths = tmp_path / "a" / "scan", tmp_path / "b" / "scan"
+    options = (*KNOWN, "--method", "upright", "--no-overlays", "--out", tmp_path / "out")
+    one_error(tubepose("estimate", *paths, *options), f"{paths[1]}: {paths[0]} has the same name 'scan'", "give the")
+    assert len(table(tmp_path / "out" / "racks.csv")) == 1
+    one_error(tubepose("estimate", *paths, *options, "--fail-fast"), "has the same name")
+
+
+def test_known_rack_needs_the_exact_truth_and_says_which_session_has_none(small_session: Path, tmp_path: Path) -> None:
+    session = edited(small_session, tmp_path / "s", lambda text: text.replace("origin: simulated", "origin: recorded"))
+    shutil.rmtree(session / "captures")
+    ended = tubepose("bench", session, "--known-rack", "--methods", "upright", "--out", tmp_path / "out")
+    assert (ended.code, "Traceback" in ended.err) == (1, False)
+    assert any("is recorded: only simulated ones know" in line for line in ended.errors)
+    assert (tmp_path / "out" / "run.json").is_file()
+
+
+def test_gt_keeps_its_problems_in_the_record(small_session: Path, tmp_path: Path) -> None:
+    session = edited(small_session, tmp_path / "s", str)
+    shutil.rmtree(session / "captures" / f"{SMALL_TUBES[0]}-001-printed")
+    ended = tubepose("gt", session, "--out", tmp_path / "out")
+    one_error(ended, f"{SMALL_TUBES[0]}-001-printed: no such file or folder")
+    record = json.loads((tmp_path / "out" / "run.json").read_text())
+    assert [f"error: {line}" for line in record["problems"]] == ended.errors
+    assert "printed-square-16.7" in record["labware_sha256"]
+    truth = table(tmp_path / "out" / "ground_truth.csv")
+    assert set(truth["tube"]) == {SMALL_TUBES[1]}
+    assert set(truth["status"]) == {"ok"}
+    assert {path.name for path in (tmp_path / "out").iterdir()} == {
+        "ground_truth.csv", "ground_truth_floor.csv", "run.json"
+    }  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (("--method", "papr"), "unknown method 'papr'; did you mean 'paper'?; known: paper, upright"),
+        (("--method", ","), "no method is named; expected one or more of paper"),
+        (("--detector", "geometrc"), "unknown detector 'geometrc'; did you mean 'geometric'?; known: geometric, yolo"),
+        (("--detector", "recorded"), "--detector recorded needs --boxes PATH"),
+        (("--detector", "recorded", "--boxes", "none"), "none: no such file or folder; expected a COCO .json"),
+        (("--detector", "yolo", "--model", "none.onnx"), "none.onnx: no such model file; expected an .onnx file"),
+        (("--rack", "round-10-3x4"), "unknown rack 'round-10-3x4'; did you mean 'round-10ml-3x4'?; known: "),
+        (("--rack", "rack.yaml"), "rack.yaml: outline_mm: Field required"),
+        (("--tubes", "blood-16x10"), "unknown tube 'blood-16x10'; did you mean 'blood-16x100'?; known: "),
+        (("--unit", "cm"), "unit 'cm' is not known; expected m or mm"),
+        (("--hint", "Z9@1,1"), "no slot Z9 in rack round-10ml-3x4; its slots run from A1 to C4"),
+        (("--config", "none.yaml"), "none.yaml: no such file"),
+        (("--config", "wrong.yaml"), "wrong.yaml: unknown key 'rak'; known keys: preprocess, rack_top, rack"),
+    ],
+)
+def test_a_wrong_option_is_one_line(
+    arguments: tuple[str, ...], message: str, small_session: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "wrong.yaml").write_text("rak: {min_fitness: 0.5}\n")
+    (tmp_path / "rack.yaml").write_text("kind: rack\nname: r\n")
+    monkeypatch.chdir(tmp_path)
+    one_error(tubepose("estimate", original(small_session), "--out", "out", *KNOWN, *arguments), message)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (("out", "--sensor", "raycst"), "unknown sensor 'raycst'; did you mean 'raycast'?; known: raycast"),
+        (("out", "--cap", "printed-square"), "unknown cap 'printed-square'; did you mean 'printed-square-16.7'?"),
+        (("out", "--tubes", ","), "--tubes names no tube; see 'tubepose labware list'"),
+        (("out", "--tubes", "centrifuge-50ml-conical"), "cannot stand in rack 'round-10ml-3x4'"),
+        (("out", "--fill", "0"), "fill is 0; expected a share"),
+        (("file",), "file: there is something already"),
+        (("file/out",), "file/out: cannot be written"),
+    ],
+)
+def test_simulate_refuses_in_one_line(
+    arguments: tuple[str, ...], message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "file").write_text("")
+    monkeypatch.chdir(tmp_path)
+    one_error(tubepose("simulate", "--rack", SMALL_RACK, "--tubes", SMALL_TUBES[0], *arguments), message)
+    assert list(digests(tmp_path)) == ["file"]
+
+
+@pytest.mark.parametrize("command", ["estimate", "gt", "bench"])
+@pytest.mark.parametrize("place", ["file", "file/out"])
+def test_results_cannot_go_where_a_file_is(command: str, place: str, small_session: Path, tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("kept")
+    one_error(tubepose(command, small_session, "--out", tmp_path / place), "cannot be a folder for results")
+    assert (tmp_path / "file").read_text() == "kept"
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ("estimate", "--out", "out"),
+        ("estimate", "x"),
+        ("estimate", "x", "--out", "out", "--seeds", "0"),
+        ("gt", "--out", "out"),
+        ("bench", "x", "--nope"),
+        ("simulate", "out"),
+        ("simulate", "out", "--rack", SMALL_RACK, "--tubes", SMALL_TUBES[0], "--format", "bag"),
+        ("frobnicate",),
+    ],
+)
+def test_wrong_usage_is_exit_2(arguments: tuple[str, ...], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    ended = tubepose(*arguments)
+    assert (ended.code, ended.out, "Traceback" in ended.err) == (2, "", False)
+    assert ended.err.startswith("Usage: ")
+    assert list(tmp_path.iterdir()) == []
+
+
+# The same content another way
+
+
+def test_simulate_gives_the_same_bytes_for_the_same_seed(tmp_path: Path) -> None:
+    options = (
+        "--rack",
+        SMALL_RACK,
+        "--tubes",
+        ",".join(SMALL_TUBES),
+        "--mixed",
+        "--trials",
+        "1",
+        "--resolution",
+        "128",
+    )
+    for name, seed in (("one", "5"), ("two", "5"), ("other", "6")):
+        ended = tubepose("simulate", tmp_path / name, *options, "--seed", seed)
+        assert (ended.code, ended.out) == (0, ""), ended.err
+    one, two, other = (digests(tmp_path / name) for name in ("one", "two", "other"))
+    assert one == two
+    assert "session.yaml" in one
+    assert not set(one.values()) & {other["session.yaml"], *(v for k, v in other.items() if k.endswith("depth.png"))}
+    assert {path.name for path in tmp_path.iterdir()} == {"one", "two", "other"}
+
+
+def test_bench_gives_the_same_bytes_twice(benched: tuple[Path, Ended], small_session: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    methods = ("--methods", "upright,paper,global-icp", "--seeds", "1")
+    assert tubepose("bench", small_session, "--out", out, *methods).code == 0
+    first, second = digests(benched[0]), digests(out)
+    assert set(first) == set(second)
+    changed = {name for name in first if first[name] != second[name]}
+    assert changed <= {"timings.csv", "run.json", "table_timing.csv", "table_timing.md", "table_timing.tex"}
+
+
+def test_recordings_give_the_same_slots_and_truth_as_folders(benched: tuple[Path, Ended], tmp_path: Path) -> None:
+    ended = tubepose(
+        "simulate", tmp_path / "s", "--rack", SMALL_RACK, "--tubes", ",".join(SMALL_TUBES), "--trials", "1",
+        "--seed", "3", "--resolution", "400", "--fill", "0.2", "--format", "mcap",
+    )  # fmt: skip
+    assert ended.code == 0
+    assert {path.suffix for path in (tmp_path / "s" / "captures").iterdir()} == {".mcap"}
+    ended = tubepose("bench", tmp_path / "s", "--methods", "upright", "--overlays", "--out", tmp_path / "out")
+    assert (ended.code, ended.errors) == (0, [])
+    assert len(list((tmp_path / "out" / "overlays").iterdir())) == 2
+    folders, recordings = (table(out / "slots.csv") for out in (benched[0], tmp_path / "out"))
+    folders = folders[folders["method"] == "upright"].reset_index(drop=True)
+    same = ["trial", "capture", "frame", "slot", "occupied", "tube", "status"]
+    assert folders[same].equals(recordings[same])
+    truths = [pd.read_csv(out / "ground_truth.csv")[list(POSE_COLUMNS)] for out in (benched[0], tmp_path / "out")]
+    # Depth images in folders are rounded to 0.02 mm.
+    assert truths[0].to_numpy() == pytest.approx(truths[1].to_numpy(), abs=1e-3)
+
+
+def test_a_known_rack_is_not_registered(small_session: Path, tmp_path: Path) -> None:
+    ended = tubepose("bench", small_session, "--known-rack", "--methods", "upright", "--out", tmp_path / "out")
+    assert ended.code == 0
+    assert "its pose given" in ended.out
+    assert set(table(tmp_path / "out" / "racks.csv")["resolved_by"]) == {"given"}
+    assert "rack" not in set(table(tmp_path / "out" / "timings.csv")["stage"])
+
+
+def test_sessions_of_one_name_are_not_mixed_up(small_session: Path, tmp_path: Path) -> None:
+    copy = edited(small_session, tmp_path / "copy", str)
+    ended = tubepose("gt", small_session, copy, "--out", tmp_path / "out")
+    one_error(ended, f"{copy}: its session name", f"that of {small_session} too; change 'name' in one of them")
+    assert len(table(tmp_path / "out" / "ground_truth.csv")) == 4
+
+
+# Boxes from elsewhere
+
+
+def constant_network(path: Path, rows: list[list[float]], names: list[str]) -> None:
+    """A network that finds these boxes (left, top, right, bottom, score, class) in every image."""
+    boxes = numpy_helper.from_array(np.array([rows], np.float32), "boxes")
+    zero = numpy_helper.from_array(np.array(0, np.float32), "zero")
+    nodes = [
+        helper.make_node("ReduceMax", ["images"], ["peak"], keepdims=0),
+        helper.make_node("Mul", ["peak", "zero"], ["nothing"]),
+        helper.make_node("Add", ["boxes", "nothing"], ["output0"]),
+    ]
+    images = helper.make_tensor_value_info("images", TensorProto.FLOAT, (1, 3, NET, NET))
+    output = helper.make_tensor_value_info("output0", TensorProto.FLOAT, None)
+    graph = helper.make_graph(nodes, "constant", [images], [output], [boxes, zero])
+    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=9)
+    helper.set_model_props(model, {"names": str(dict(enumerate(names))), "task": "detect"})
+    onnx.save(model, str(path))
+
+
+@pytest.mark.parametrize("source", ["yolo", "recorded"])
+def test_boxes_from_elsewhere_give_the_same_slots(
+    source: str, small_session: Path, estimated: tuple[Path, Ended], tmp_path: Path
+) -> None:
+    rack, tube = load_rack(SMALL_RACK), load_tube(SMALL_TUBES[1])
+    frame = next(open_captures(original(small_session))[0].frames())
+    found = GeometricDetector(rack, (tube,), Config()).detect(frame)
+    names = list(dict.fromkeys(box.class_name for box in found))
+    height, width = frame.cloud_m.shape[:2]
+    if source == "yolo":
+        zoom = NET / width
+        rows = [[*(edge * zoom for edge in box.box_xyxy_px), 0.9, names.index(box.class_name)] for box in found]
+        constant_network(tmp_path / "boxes.onnx", rows, names)
+        place = ("--model", tmp_path / "boxes.onnx")
+    else:
+        (tmp_path / "boxes").mkdir()
+        (tmp_path / "boxes" / "classes.txt").write_text("\n".join(names))
+        write_yolo_txt(tmp_path / "boxes" / f"{frame.capture}.txt", found, (width, height), names)
+        place = ("--boxes", tmp_path / "boxes")
+    hint = yaml.safe_load((small_session / "session.yaml").read_text())["trials"][1]["hint"]
+    ended = tubepose(
+        "estimate", original(small_session), *KNOWN, "--detector", source, *place, "--no-overlays",
+        "--hint", f"{hint['slot']}@{hint['pixel'][0]},{hint['pixel'][1]}", "--out", tmp_path / "out",
+    )  # fmt: skip
+    assert (ended.code, ended.errors, "ambiguous" in ended.err) == (0, [], False)
+    slots, wanted = table(tmp_path / "out" / "slots.csv"), table(estimated[0] / "slots.csv")
+    wanted = wanted[(wanted["capture"] == frame.capture) & (wanted["method"] == "paper")]
+    assert list(slots["occupied"]) == list(wanted["occupied"])
+    assert list(slots["status"]).count("ok") == 2
+    record = json.loads((tmp_path / "out" / "run.json").read_text())
+    assert record["detector"] == source
+    assert str(place[1]) in record["inputs_sha256"]

@@ -1,0 +1,239 @@
+"""The stages together: from a frame with known poses to estimates, and what each stage hands on when it fails."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+import scenes
+
+from tubepose.capture.session import SlotHint
+from tubepose.config import Config
+from tubepose.detection import Detection
+from tubepose.detection.geometric import GeometricDetector
+from tubepose.labware import load_rack, load_tube
+from tubepose.pipeline import DEFAULT_METHOD, METHODS, STOCHASTIC, estimate_tubes, prepare_scene
+from tubepose.rack import RackStatus
+from tubepose.transforms import make_transform, tilt_rad, transform_points
+from tubepose.tube import TubeStatus
+
+CONFIG = Config()
+RACK = load_rack("chen2023-soft-5x10")
+TUBES = tuple(load_tube(f"chen2023-tube-{i}") for i in (1, 2, 3))
+T_CAMERA_RACK = scenes.camera_from_rack(RACK, 0.3, 0.15)
+PLACED = {
+    "A1": (TUBES[0], scenes.tube_pose(RACK, "A1", 0.004, -0.003)),
+    "C5": (TUBES[1], scenes.tube_pose(RACK, "C5", -0.015, 0.02)),
+    "E10": (TUBES[2], scenes.tube_pose(RACK, "E10", 0.008, 0.008)),
+}
+
+
+@dataclass(frozen=True)
+class Fixed:
+    """A detector that says what it is told to."""
+
+    detections: tuple[Detection, ...]
+    name: str = "recorded"
+
+    def detect(self, frame):
+        return self.detections
+
+
+def hint_for(T_camera_rack):
+    place = transform_points(T_camera_rack, np.array([*RACK.slot("A1").center_m, RACK.height_m]))
+    return SlotHint(slot="A1", pixel=tuple(scenes.CAMERA.project(place)))
+
+
+def frame_of(placed=PLACED, T=T_CAMERA_RACK, organised=False):
+    view = scenes.towards_camera(T)
+    tubes = [
+        scenes.tube_surface(tube, T_rack_tube, RACK.height_m, seed=i, seen_from=view)
+        for i, (tube, T_rack_tube) in enumerate(placed.values())
+    ]
+    points = transform_points(T, np.vstack([scenes.rack_top(RACK), *tubes]))
+    frame = scenes.organised(points) if organised else scenes.unorganised(points)
+    return frame if organised else type(frame)(frame.cloud_m, None, scenes.CAMERA, None, "test", organised=False)
+
+
+def prepare(frame, tubes=TUBES, detector=None, hint=None):
+    return prepare_scene(frame, RACK, tubes, detector or GeometricDetector(RACK, tubes), CONFIG, hint)
+
+
+@pytest.fixture(scope="module")
+def scene():
+    return prepare(frame_of(), hint=hint_for(T_CAMERA_RACK))
+
+
+def test_the_rivals_and_ours_have_their_names():
+    assert set(METHODS) >= {"paper", "upright", "slot-icp", "global-icp"}
+    assert DEFAULT_METHOD in METHODS
+    assert set(METHODS) >= STOCHASTIC == {"global-icp"}
+
+
+def test_slots_and_kinds_of_all_tubes_are_found(scene):
+    assert scene.rack_pose.status is RackStatus.OK
+    assert scene.rack_pose.resolved_by == "hint"
+    assert {target.slot: target.tube for target in scene.targets} == {slot: tube for slot, (tube, _) in PLACED.items()}
+    assert all(target.reason == "" for target in scene.targets)
+
+
+def test_the_paper_recovers_the_poses_in_both_frames(scene):
+    estimates, _ = estimate_tubes(scene, "paper", CONFIG)
+    assert len(estimates) == 3
+    for estimate in estimates:
+        _, T_rack_tube = PLACED[estimate.target.slot]
+        assert estimate.pose.status is TubeStatus.OK
+        T_camera_tube = T_CAMERA_RACK @ T_rack_tube
+        assert np.rad2deg(tilt_rad(estimate.T_camera_tube[:3, 2], T_camera_tube[:3, 2])) < 0.3
+        assert np.linalg.norm((estimate.T_camera_tube - T_camera_tube)[:3, 3]) < 0.3e-3
+        assert np.allclose(estimate.T_camera_tube, scene.rack_pose.T_camera_rack @ estimate.pose.T_rack_tube)
+
+
+@pytest.mark.parametrize("method", sorted(METHODS))
+def test_every_method_answers_for_every_target_once(scene, method):
+    seed = 0 if method in STOCHASTIC else None
+    estimates, times = estimate_tubes(scene, method, CONFIG, seed)
+    assert [estimate.target for estimate in estimates] == list(scene.targets)
+    assert {(estimate.method, estimate.seed) for estimate in estimates} == {(method, seed)}
+    assert [time.instance for time in times] == [target.slot for target in scene.targets]
+    assert all((time.stage, time.method, time.seed) == ("tube", method, seed) for time in times)
+    assert all(time.duration_ms > 0 for time in times)
+
+
+def test_the_shared_stages_are_timed_in_the_papers_order(scene):
+    assert [time.stage for time in scene.times] == ["detect", "rack", "slots"]
+    assert {time.method for time in scene.times} == {"all"}
+
+
+def test_an_organised_frame_without_intrinsics_still_uses_the_hint():
+    frame = frame_of(organised=True)
+    T_turned = T_CAMERA_RACK @ np.diag([-1.0, -1.0, 1.0, 1.0])
+    rays = scenes.CAMERA.rays()
+    exact = np.where(np.isfinite(frame.cloud_m), rays * frame.cloud_m[..., 2:], np.nan)
+    bare = type(frame)(exact, None, None, None, "test")
+    found = prepare(bare, hint=hint_for(T_turned))
+    assert found.intrinsics.fx == pytest.approx(scenes.CAMERA.fx, rel=0.01)
+    assert found.rack_pose.resolved_by == "hint"
+    assert {target.slot for target in found.targets} == {"E10", "C6", "A1"}  # the same places, named from the other end
+
+
+def test_moving_the_camera_changes_no_pose_in_the_rack(scene):
+    T_moved_camera = make_transform(
+        np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
+        @ scenes.camera_from_rack(RACK, 0, 0.1)[:3, :3]
+        @ np.diag([1, -1, -1]),
+        np.array([0.02, 0.06, 0.03]),
+    )
+    frame = frame_of()
+    T_new = T_moved_camera @ T_CAMERA_RACK
+    moved = type(frame)(
+        transform_points(T_moved_camera, frame.cloud_m), None, scenes.CAMERA, None, "test", organised=False
+    )
+    found = prepare(moved, hint=hint_for(T_new))
+    before = {e.target.slot: e.pose for e in estimate_tubes(scene, "paper", CONFIG)[0]}
+    after = {e.target.slot: e.pose for e in estimate_tubes(found, "paper", CONFIG)[0]}
+    assert set(after) == set(before)
+    for slot, pose in after.items():
+        assert np.rad2deg(tilt_rad(pose.T_rack_tube[:3, 2], before[slot].T_rack_tube[:3, 2])) < 0.15
+        assert np.allclose(pose.T_rack_tube[:3, 3], before[slot].T_rack_tube[:3, 3])
+
+
+def test_boxes_of_a_detector_select_their_points():
+    frame = frame_of(organised=True)
+    everything = (0.0, 0.0, 639.0, 479.0)
+    tube, T_rack_tube = PLACED["C5"]
+    axis = np.array([[0.0, 0.0, RACK.depth_m], [0.0, 0.0, tube.height_m]])
+    u, v = scenes.CAMERA.project(transform_points(T_CAMERA_RACK @ T_rack_tube, axis)).T
+    box = (u.min() - 16, v.min() - 16, u.max() + 16, v.max() + 16)
+    detector = Fixed((Detection("rack", 0.9, everything, "recorded"), Detection("purple-cap", 0.8, box, "recorded")))
+    found = prepare(frame, detector=detector, hint=hint_for(T_CAMERA_RACK))
+    (target,) = found.targets
+    assert (target.detection, target.slot, target.tube) == (1, "C5", TUBES[1])
+    (estimate,), _ = estimate_tubes(found, "paper", CONFIG)
+    assert estimate.pose.status is TubeStatus.OK
+
+
+def test_without_a_rack_nothing_is_invented():
+    frame = frame_of()
+    found = prepare(frame, detector=Fixed((Detection("tube", 1.0, (0.0, 0.0, 9.0, 9.0), "recorded"),)))
+    assert found.rack_pose.status is RackStatus.NOT_FOUND
+    assert found.rack_pose.reason == "the detector found no rack"
+    assert found.targets == ()
+    assert estimate_tubes(found, "paper", CONFIG) == ((), ())
+    assert [time.stage for time in found.times] == ["detect", "rack"]
+
+
+def test_the_rack_with_the_best_score_is_taken():
+    frame = frame_of()
+    rows = np.arange(frame.points_m.shape[0])
+    nowhere = Detection("rack", 0.3, (np.nan,) * 4, "recorded", rows[:10])
+    right = Detection("rack", 0.9, (np.nan,) * 4, "recorded", rows)
+    assert prepare(frame, detector=Fixed((nowhere, right))).rack_pose.status is RackStatus.OK
+
+
+def test_an_empty_frame_has_a_status_and_no_estimate():
+    found = prepare(scenes.unorganised(np.full((100, 3), np.nan)))
+    assert found.rack_pose.status is RackStatus.INSUFFICIENT
+    assert found.rack_pose.T_camera_rack is None
+    assert found.targets == ()
+
+
+def test_a_flat_wall_has_a_status_and_no_estimate():
+    grid = np.stack(np.meshgrid(np.arange(-0.2, 0.2, 4e-3), np.arange(-0.2, 0.2, 4e-3), [0.6]), axis=-1).reshape(-1, 3)
+    found = prepare(scenes.unorganised(grid))
+    assert found.rack_pose.status is not RackStatus.OK
+    assert found.rack_pose.reason
+    assert found.targets == ()
+
+
+def test_a_target_that_no_method_can_be_asked_is_rejected_with_its_reason():
+    lying = np.random.default_rng(0).uniform([-50, -8, 60], [50, 8, 70], (800, 3)) * 1e-3
+    points = transform_points(T_CAMERA_RACK, np.vstack([scenes.rack_top(RACK), lying]))
+    rows = np.arange(len(points))
+    box = (np.nan,) * 4
+    detector = Fixed(
+        (Detection("rack", 1.0, box, "recorded", rows), Detection("tube", 1.0, box, "recorded", rows[-800:]))
+    )
+    found = prepare(scenes.unorganised(points), detector=detector)
+    assert found.targets[0].slot is None
+    for method in METHODS:
+        (estimate,), times = estimate_tubes(found, method, CONFIG, 0)
+        assert estimate.pose.status is TubeStatus.REJECTED
+        assert "lies across the rack?" in estimate.pose.reason
+        assert estimate.pose.T_rack_tube is None
+        assert estimate.T_camera_tube is None
+        assert times == ()
+
+
+def test_without_tube_models_the_slots_are_known_and_the_reason_names_the_option():
+    capped = {slot: PLACED[slot] for slot in ("C5", "E10")}
+    found = prepare(frame_of(capped), tubes=(), hint=hint_for(T_CAMERA_RACK))
+    assert {target.slot for target in found.targets} == set(capped)
+    assert {(target.tube, target.reason) for target in found.targets} == {(None, "no tube model given (--tubes)")}
+
+
+def test_an_unknown_kind_keeps_its_slot_and_says_why():
+    found = prepare(frame_of({"C5": PLACED["C5"]}), tubes=TUBES[2:], hint=hint_for(T_CAMERA_RACK))
+    (target,) = found.targets
+    assert (target.slot, target.tube) == ("C5", None)
+    assert "unknown type: " in target.reason
+    (estimate,), _ = estimate_tubes(found, "paper", CONFIG)
+    assert (estimate.pose.status, estimate.pose.reason) == (TubeStatus.REJECTED, target.reason)
+
+
+def test_points_in_the_box_that_no_such_tube_can_own_do_not_reach_the_fit():
+    tube, T_rack_tube = PLACED["C5"]
+    own = scenes.tube_surface(tube, T_rack_tube, RACK.height_m, seen_from=scenes.towards_camera(T_CAMERA_RACK))
+    high = own[:60] * [1, 1, 0] + [0, 0, RACK.floor_m + tube.height_m + 25e-3]
+    points = transform_points(T_CAMERA_RACK, np.vstack([scenes.rack_top(RACK), own, high]))
+    rows = np.arange(len(points))
+    box = (np.nan,) * 4
+    standing = rows[-len(own) - len(high) :]
+    detector = Fixed(
+        (Detection("rack", 1.0, box, "recorded", rows), Detection("purple-cap", 1.0, box, "recorded", standing))
+    )
+    frame = type(frame_of())(points[None], None, scenes.CAMERA, None, "test", organised=False)
+    (target,) = prepare(frame, detector=detector, hint=hint_for(T_CAMERA_RACK)).targets
+    assert target.slot == "C5"
+    above = np.sum(own[:, 2] > RACK.height_m + CONFIG.slots.clearance_m)
+    assert len(target.points_m) == pytest.approx(above, abs=0.01 * above)
+    assert target.points_m[:, 2].max() < RACK.floor_m + tube.height_m + 1e-3
