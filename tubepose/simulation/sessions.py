@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import hashlib
 import os
 import shutil
 from collections.abc import Callable, Iterator, Sequence
@@ -116,7 +117,7 @@ def simulate_session(
         for done, plan in enumerate(plans):
             entries.append(_simulate_trial(aside, plan, settings, progress, 2 * done, 2 * len(plans)))
         # Not named after the folder: the same seed gives the same bytes anywhere.
-        _write_session(aside, f"{sensor}-{rack.name}-{resolution}-seed{seed}", settings, entries)
+        _write_session(aside, _session_name(settings, entries), settings, entries)
         if out.exists():
             out.rmdir()
         aside.rename(out)
@@ -233,6 +234,13 @@ def _hint(scene: Scene, camera: StructuredLightCamera, rng: np.random.Generator)
     k = camera.intrinsics
     click = camera.intrinsics.project(opening[:3]) + rng.normal(0, CLICK_ERROR_PX * k.width / 1376, 2)
     return {"slot": slot.name, "pixel": [int(value) for value in np.rint(click)]}
+
+
+def _session_name(settings: _Settings, entries: list[dict[str, Any]]) -> str:
+    """Name that tells sessions apart: sensor, rack and seed, and a digest of what stands where in every trial."""
+    content = f"{settings.camera.intrinsics.width} {settings.cap.name} {entries}"
+    digest = hashlib.sha256(content.encode()).hexdigest()[:8]
+    return f"{settings.sensor}-{settings.rack.name}-seed{settings.seed}-{digest}"
 
 
 def _write_session(folder: Path, name: str, settings: _Settings, entries: list[dict[str, Any]]) -> None:
