@@ -57,16 +57,8 @@ def bench(
     settings = load_config(config)
     names = read_methods(methods)
     detector_for = make_detector(detector, model, boxes, classes, layout, settings)
-    folders: list[Path] = []
     jobs: list[Job] = []
-    problems: list[str] = []
-    for path in sessions or [sample_session()]:
-        try:
-            folders += find_sessions([path])
-        except TubePoseError as problem:
-            if fail_fast:
-                raise
-            problems.append(str(problem))
+    folders, problems = find_sessions(sessions or [sample_session()], fail_fast=fail_fast)
     measured = measure_sessions(folders, out, fail_fast=fail_fast)
     for session in measured.sessions:
         try:

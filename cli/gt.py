@@ -20,22 +20,13 @@ def gt(
     the exact truth.
     """
     from tubepose.config import Config
-    from tubepose.errors import TubePoseError
     from tubepose.provenance import run_record
     from tubepose.report.writing import write_json
     from tubepose_cli.inputs import find_sessions
     from tubepose_cli.show import finish, say
     from tubepose_cli.truth import measure_sessions
 
-    problems: list[str] = []
-    folders: list[Path] = []
-    for path in sessions:
-        try:
-            folders += find_sessions([path])
-        except TubePoseError as problem:
-            if fail_fast:
-                raise
-            problems.append(str(problem))
+    folders, problems = find_sessions(sessions, fail_fast=fail_fast)
     measured = measure_sessions(folders, out, fail_fast=fail_fast)
     problems += measured.problems
     caps = [session.printed_cap for session in measured.sessions if session.printed_cap is not None]

@@ -58,21 +58,24 @@ def unknown_name(kind: str, name: str, known: Iterable[str]) -> str:
     return f"unknown {kind} '{name}'{guess}; known: {', '.join(known)}"
 
 
-def find_sessions(paths: Sequence[Path]) -> list[Path]:
-    """Session folders at or below the given paths."""
+def find_sessions(paths: Sequence[Path], *, fail_fast: bool = False) -> tuple[list[Path], list[str]]:
+    """Session folders at or below the given paths, and one line per path that has none."""
     from tubepose.capture.session import is_session
     from tubepose.errors import CaptureError
 
     sessions: list[Path] = []
+    problems: list[str] = []
     for path in paths:
-        if not path.exists():
-            raise CaptureError(f"{path}: no such file or folder; expected a session folder")
         folder = path.parent if path.name == "session.yaml" else path
         found = [folder] if is_session(folder) else sorted(p.parent for p in folder.glob("*/session.yaml"))
-        if not found:
-            raise CaptureError(f"{path}: no session.yaml there or one folder below; see docs/capture-format.md")
         sessions += found
-    return sessions
+        if not path.exists():
+            problems.append(f"{path}: no such file or folder; expected a session folder")
+        elif not found:
+            problems.append(f"{path}: no session.yaml there or one folder below; see docs/capture-format.md")
+        if problems and fail_fast:
+            raise CaptureError(problems[0])
+    return sessions, problems
 
 
 def capture_jobs(
