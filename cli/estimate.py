@@ -16,7 +16,8 @@ def estimate(
     out: Annotated[Path, typer.Option(help="Folder for the results; nothing is written anywhere else.")],
     rack: Annotated[str | None, typer.Option(help="Rack by name or YAML file; a session knows its own.")] = None,
     tubes: Annotated[
-        str | None, typer.Option(help="Kinds of tube that can be there: names or files, with commas.")
+        str | None,
+        typer.Option(help="Kinds of tube that can be there: names or files, with commas; goes before a session's own."),
     ] = None,
     method: Annotated[str, typer.Option(help="paper, upright, slot-icp or global-icp.")] = "paper",
     detector: Annotated[str, typer.Option(help="Source of boxes: geometric, yolo or recorded.")] = "geometric",
@@ -24,7 +25,12 @@ def estimate(
     boxes: Annotated[Path | None, typer.Option(help="Boxes of --detector recorded: YOLO txt or COCO json.")] = None,
     classes: Annotated[Path | None, typer.Option(help="Class names of the boxes or the model, one a line.")] = None,
     layout: Annotated[str | None, typer.Option(help="Output layout of the model, where it cannot be told.")] = None,
-    unit: Annotated[str | None, typer.Option(help="Unit of a bare .ply file: m (default) or mm.")] = None,
+    unit: Annotated[
+        str | None,
+        typer.Option(
+            help="Unit of the clouds, m or mm; goes before capture.yaml. A bare .ply file is in m without it."
+        ),
+    ] = None,
     cloud_topic: Annotated[str | None, typer.Option(help="Topic of the clouds in an .mcap file.")] = None,
     depth_topic: Annotated[str | None, typer.Option(help="Topic of the depth images in an .mcap file.")] = None,
     image_topic: Annotated[str | None, typer.Option(help="Topic of the images in an .mcap file.")] = None,
@@ -48,7 +54,7 @@ def estimate(
     from tubepose.labware import load_rack
     from tubepose_cli.inputs import capture_jobs, make_detector, read_methods, read_tubes, refuse_twins
     from tubepose_cli.results import run_estimates
-    from tubepose_cli.show import finish, say
+    from tubepose_cli.show import describe_tubes, finish, say
 
     settings = load_config(config)
     rack_model = load_rack(rack) if rack is not None else None
@@ -81,12 +87,18 @@ def estimate(
         problems=problems, detector=detector,
     )  # fmt: skip
     for row in tables.racks:
-        turn = ", turn ambiguous by 180 degrees" if row["ambiguous"] else ""
+        turn = (
+            ", turn ambiguous by 180 degrees (slot names may be swapped; --hint SLOT@U,V settles it)"
+            if row["ambiguous"]
+            else ""
+        )
         if row["status"] == "ok":
             rack_words = f"ok, inlier rmse {row['inlier_rmse_m'] * 1e3:.2f} mm{turn}"
         else:
             rack_words = f"{row['status']}: {row['reason']}"
         keys = ("session", "trial", "capture", "frame", "method")
-        held = sum(e["status"] == "ok" for e in tables.estimates if all(e[key] == row[key] for key in keys))
-        say(f"{row['capture']} frame {row['frame']}: rack {row['rack']} {rack_words}; {held} tubes ok")
+        tubes_words = describe_tubes([e for e in tables.estimates if all(e[key] == row[key] for key in keys)])
+        say(f"{row['capture']} frame {row['frame']}: rack {row['rack']} {rack_words}; {tubes_words}")
+    if tubes is None and any(not job.tubes for job in jobs):
+        say("no --tubes given: only the rack and its slots are estimated")
     finish([*problems, *tables.problems])

@@ -35,6 +35,7 @@ def gt(
         sys.argv, Config(), [*labware, *caps], folders, problems=problems, ground_truth_config=measured.config
     )
     write_json(out / "run.json", record)
-    for line in measured.notes:
-        say(line)
+    if measured.sessions:
+        for line in measured.notes:
+            say(line)
     finish(problems)

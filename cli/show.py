@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import typer
 
@@ -46,6 +47,15 @@ def show_table(table: pd.DataFrame, title: str, notes: Sequence[str] = ()) -> No
     for note in notes:
         console.print(f"  {note}", highlight=False, markup=False)
     console.print()
+
+
+def describe_tubes(estimates: Sequence[Mapping[str, Any]]) -> str:
+    """How many tubes of a frame are ok, rejected and failed, and the commonest reason."""
+    counts = Counter(str(row["status"]) for row in estimates)
+    words = [f"{counts['ok']} tubes ok", *(f"{counts[name]} {name}" for name in ("rejected", "failed") if counts[name])]
+    reasons = Counter(str(row["reason"]) for row in estimates if row["reason"])
+    why = f" ({reasons.most_common(1)[0][0]})" if reasons else ""
+    return ", ".join(words) + why
 
 
 def finish(problems: Sequence[str]) -> None:

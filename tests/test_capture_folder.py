@@ -310,7 +310,7 @@ def test_cloud_that_is_not_pixel_to_pixel_is_projected(tmp_path):
 @pytest.mark.parametrize(
     ("keys", "message"),
     [
-        ({}, "unit: Field required"),
+        ({}, "the key 'unit' is missing"),
         ({"unit": "cm"}, r"unit: Input should be 'm' or 'mm' \(found 'cm'\)"),
         ({"unit": "m", "units": 3}, "unknown key 'units'; known keys: unit, cloud"),
         ({"unit": "m", "intrinsics": {**camera_keys(), "f": 1}}, "unknown key 'intrinsics.f'; known keys: width"),

@@ -28,6 +28,7 @@ from tubepose.evaluation import AXES
 from tubepose.labware import load_rack, load_tube
 from tubepose.records import ESTIMATE_COLUMNS, POSE_COLUMNS, RACK_COLUMNS, SLOT_COLUMNS, TIMING_COLUMNS
 from tubepose.transforms import FloatArray
+from tubepose_cli.show import describe_tubes
 
 KNOWN = ("--rack", SMALL_RACK, "--tubes", SMALL_TUBES[1])
 DOCS = Path(__file__).parents[1] / "docs" / "outputs.md"
@@ -406,7 +407,7 @@ def test_gt_keeps_its_problems_in_the_record(small_session: Path, tmp_path: Path
         (("--detector", "recorded", "--boxes", "none"), "none: no such file or folder; expected a COCO .json"),
         (("--detector", "yolo", "--model", "none.onnx"), "none.onnx: no such model file; expected an .onnx file"),
         (("--rack", "round-10-3x4"), "unknown rack 'round-10-3x4'; did you mean 'round-10ml-3x4'?; known: "),
-        (("--rack", "rack.yaml"), "rack.yaml: outline_mm: Field required"),
+        (("--rack", "rack.yaml"), "rack.yaml: the key 'outline_mm' is missing"),
         (("--tubes", "blood-16x10"), "unknown tube 'blood-16x10'; did you mean 'blood-16x100'?; known: "),
         (("--unit", "cm"), "unit 'cm' is not known; expected m or mm"),
         (("--hint", "Z9@1,1"), "no slot Z9 in rack round-10ml-3x4; its slots run from A1 to C4"),
@@ -594,3 +595,15 @@ def test_boxes_from_elsewhere_give_the_same_slots(
     record = json.loads((tmp_path / "out" / "run.json").read_text())
     assert record["detector"] == source
     assert str(place[1]) in record["inputs_sha256"]
+
+
+def test_what_became_of_the_tubes_is_said_with_the_commonest_reason() -> None:
+    rows = [{"status": "ok", "reason": ""}, *({"status": "rejected", "reason": "too tall"} for _ in range(2))]
+    assert describe_tubes(rows) == "1 tubes ok, 2 rejected (too tall)"
+    assert describe_tubes([]) == "0 tubes ok"
+
+
+def test_without_tubes_it_is_said_that_only_the_rack_is_estimated(small_session: Path, tmp_path: Path) -> None:
+    ended = tubepose("estimate", original(small_session), "--rack", SMALL_RACK, "--out", tmp_path / "out")
+    assert ended.code == 0
+    assert "only the rack and its slots are estimated" in ended.err

@@ -215,7 +215,7 @@ def test_load_from_a_file_is_relative_to_its_folder(tmp_path: Path) -> None:
         ("[17, 17]", "[17, 18]", r"a round slot has one diameter"),
         ("kind: rack", "kind: rak", r"expected 'kind: rack', 'kind: tube' or 'kind: cap', found 'rak'"),
         ("kind: rack", "kind: tube", r"unknown key 'outline_mm'"),
-        ("height_mm: 50\n", "", r"height_mm: Field required"),
+        ("height_mm: 50\n", "", r"the key 'height_mm' is missing"),
         ("grid:", "grid: [", r"not valid YAML"),
     ],
 )

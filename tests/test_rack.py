@@ -91,6 +91,12 @@ def test_a_hint_halfway_between_the_turns_decides_nothing(soft_scan):
     assert (pose.ambiguous, pose.resolved_by) == (True, "rule")
 
 
+def test_a_hint_far_from_both_places_decides_nothing(soft_scan):
+    for pixel in ((-5000.0, 300.0), (9000.0, 9000.0)):
+        pose = register_rack(soft_scan, SOFT, CONFIG, SlotHint(slot="A1", pixel=pixel), scenes.CAMERA)
+        assert (pose.ambiguous, pose.resolved_by) == (True, "rule")
+
+
 def test_a_hint_without_intrinsics_is_not_used(soft_scan):
     pose = register_rack(soft_scan, SOFT, CONFIG, SlotHint(slot="A1", pixel=(0.0, 0.0)), None)
     assert (pose.ambiguous, pose.resolved_by) == (True, "rule")

@@ -209,8 +209,7 @@ def _hypotheses(top: RackTop, band_m: FloatArray, rack: RackModel) -> list[Float
             R = box.R[:, order] * np.array(signs)
             if np.linalg.det(R) > 0 and R[:, 2] @ up > np.cos(np.deg2rad(30)):
                 found.append(make_transform(R, box.center - rack.height_m * R[:, 2]))
-    # The box of a very oblique or tiny patch can be useless: the rectangle of the band is the same start.
-    return found or [top.T_camera_top @ make_transform(np.eye(3), np.array([0.0, 0.0, -rack.height_m]))]
+    return found
 
 
 def _register_all(
@@ -225,6 +224,10 @@ def _register_all(
     outline_m = np.vstack([scan_m, transform_points(top.T_camera_top, corners)])
     starts = _hypotheses(top, outline_m, rack)
     coarse = [_icp(few, target, start, config, config.icp_distances_m[:1]) for start in starts]
+    if max((r.fitness for r in coarse), default=0.0) < config.min_fitness:
+        # Few points above or below the band can turn the whole box; the band's own rectangle does not see them.
+        level_start = top.T_camera_top @ make_transform(np.eye(3), np.array([0.0, 0.0, -rack.height_m]))
+        coarse.append(_icp(few, target, level_start, config, config.icp_distances_m[:1]))
     best = max(coarse, key=lambda r: (round(r.fitness, 3), -r.inlier_rmse_m))
     fine = config.icp_distances_m[1:]
     turned_start = best.T_camera_rack @ HALF_TURN
@@ -270,7 +273,9 @@ def _choose_turn(
         point = np.array([*rack.slot(hint.slot).center_m, rack.height_m])
         pixels = [intrinsics.project(transform_points(r.T_camera_rack, point)) for r in pair]
         distances = [float(np.hypot(*(pixel - np.array(hint.pixel)))) for pixel in pixels]
-        if abs(distances[0] - distances[1]) > 0.25 * float(np.hypot(*(pixels[0] - pixels[1]))) > 0:
+        # A hint far from both places says nothing: swapped coordinates, or a pixel of another image.
+        near = 0.25 * float(np.hypot(*(pixels[0] - pixels[1])))
+        if min(distances) < near < abs(distances[0] - distances[1]):
             return pair[0 if distances[0] < distances[1] else 1], "hint"
     # Decided by the image's diagonal: racks stand along the image's sides more often than along its diagonal.
     return pair[0 if best.T_camera_rack[:2, 0].sum() > 0 else 1], "rule"

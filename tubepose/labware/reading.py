@@ -52,6 +52,10 @@ def _explain(model: type[BaseModel], entry: Any) -> str:
     if entry["type"] == "extra_forbidden":
         known = _known_keys(model, entry["loc"][:-1])
         return f"unknown key '{place}'" + (f"; known keys: {', '.join(known)}" if known else "")
+    if entry["type"] == "missing":
+        return f"the key '{place}' is missing"
+    if entry["type"] == "tuple_type":
+        return f"{place}: expected a list, for example [16.5, 16.5] (found {entry['input']!r})"
     message = entry["msg"].removeprefix("Value error, ")
     message = f"{place}: {message}" if place else message
     given = entry["input"]

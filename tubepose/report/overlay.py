@@ -175,12 +175,25 @@ def _draw_names(picture: Picture, scene: Scene, estimates: Sequence[TubeEstimate
         return
     heights = {e.target.slot: e.target.tube.height_m for e in estimates if e.target.slot and e.target.tube}
     colors = {e.target.slot: COLORS_BGR[e.pose.status.value] for e in estimates}
+    tops = [place for e in estimates if (place := _top_circle(e, project)) is not None]
     for slot in scene.rack.all_slots:
         z = scene.rack.floor_m + heights[slot.name] if slot.name in heights else scene.rack.height_m
         place = project(transform_points(T, np.array([*slot.center_m, z])))
-        if np.isfinite(place).all():
+        # The name of an empty slot on a tube that hides it would read as the tube's.
+        hidden = slot.name not in heights and any(np.hypot(*(place - top[:2])) < top[2] for top in tops)
+        if np.isfinite(place).all() and not hidden:
             u, v = _pixel(place)
             _text(picture, slot.name, (u - 12, v + 5), 0.45, colors.get(slot.name, _TEXT_BGR))
+
+
+def _top_circle(estimate: TubeEstimate, project: Project) -> FloatArray | None:
+    """Where a tube's top is seen: u, v and radius in the picture's pixels; None without a pose."""
+    tube, T = estimate.target.tube, estimate.T_camera_tube
+    if tube is None or T is None:
+        return None
+    points = np.array([[0, 0, tube.height_m], [tube.max_radius_m, 0, tube.height_m]])
+    center, edge = project(transform_points(T, points))
+    return np.array([*center, np.hypot(*(edge - center))])
 
 
 def _legend(width: int, scene: Scene, estimates: Sequence[TubeEstimate]) -> Picture:
