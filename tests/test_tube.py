@@ -207,9 +207,9 @@ def test_a_tube_that_leans_more_than_its_slot_allows_is_rejected_with_its_pose()
 
 
 @pytest.mark.parametrize("count", [0, 1, 24])
-def test_fewer_points_than_the_least_fail_without_a_pose(count):
+def test_fewer_points_than_the_least_are_rejected_without_a_pose(count):
     pose = fit_tube(seen(TUBE_2)[:count], SLOT, TUBE_2, RACK, CONFIG)
-    assert pose.status is TubeStatus.FAILED
+    assert pose.status is TubeStatus.REJECTED
     assert pose.T_rack_tube is None
     assert pose.n_points == count
     assert pose.reason == f"{count} points above the rack's top, at least 25 expected"

@@ -29,9 +29,10 @@ class TubePose:
     """Pose of a tube in the rack frame.
 
     Attributes:
-        status: OK; REJECTED (there is a pose, and it cannot be true); FAILED (there is no pose).
+        status: OK; REJECTED (the pose cannot be true, or the points do not allow one); FAILED (a rival ended without).
         reason: In words, empty when OK.
-        T_rack_tube: Array of shape (4, 4), metres; origin at the tube's bottom, z along its axis. None when FAILED.
+        T_rack_tube: Array of shape (4, 4), metres; origin at the tube's bottom, z along its axis. None where
+            there is no pose.
         score: 0 to 1, larger is more trustworthy; only comparable within one method.
         inlier_rmse_m: RMS of the method's own residual, metres; NaN where it has none.
         fitness: Share of the points that the pose explains; NaN where the method does not say.
@@ -149,7 +150,7 @@ def fit_tube(
     del seed
     if len(points_m) < config.tube.min_points:
         return TubePose(
-            TubeStatus.FAILED,
+            TubeStatus.REJECTED,
             f"{len(points_m)} points above the rack's top, at least {config.tube.min_points} expected",
             n_points=len(points_m),
         )
