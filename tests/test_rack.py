@@ -10,8 +10,8 @@ from scipy.spatial.transform import Rotation
 from tubepose.capture.session import SlotHint
 from tubepose.config import Config, RackConfig
 from tubepose.labware import load_rack, load_tube
-from tubepose.rack import HALF_TURN, RackStatus, rack_template_m, register_rack
-from tubepose.transforms import invert_transform, make_transform, transform_points
+from tubepose.rack import RackStatus, rack_template_m, register_rack
+from tubepose.transforms import HALF_TURN, invert_transform, make_transform, transform_points
 
 CONFIG = Config()
 SOFT = load_rack("chen2023-soft-5x10")

@@ -13,7 +13,7 @@ from scipy.spatial import cKDTree
 
 from tubepose.config import PreprocessConfig, RackTopConfig
 from tubepose.labware import RackModel
-from tubepose.transforms import FloatArray, invert_transform, make_transform, transform_points
+from tubepose.transforms import HALF_TURN, FloatArray, invert_transform, make_transform, transform_points
 
 Rows = NDArray[np.intp]
 TALLEST_TUBE_M = 0.15
@@ -259,7 +259,7 @@ def _rectangle(
         sample = thin(local[inside], 2000)
         shares = [float(np.mean(rack.top_signed_distance_m(k * sample) > 1e-3)) for k in (1, -1)]
     if shares[1] < shares[0]:
-        T_top_camera = np.diag([-1.0, -1.0, 1.0, 1.0]) @ T_top_camera
+        T_top_camera = HALF_TURN @ T_top_camera
     size = (float(size_m[0]), float(size_m[1]))
     return RackTop(invert_transform(T_top_camera), size, error_m, min(shares), band[inside])
 

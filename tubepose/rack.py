@@ -30,9 +30,8 @@ from tubepose.preprocessing import (
     voxel_downsample,
 )
 from tubepose.rack_acceptance import agreement, refusal, too_coarse, too_noisy
-from tubepose.transforms import FloatArray, invert_transform, make_transform, transform_points
+from tubepose.transforms import HALF_TURN, FloatArray, invert_transform, make_transform, transform_points
 
-HALF_TURN = np.diag([-1.0, -1.0, 1.0, 1.0])
 MIN_POINTS = 50
 
 
@@ -136,10 +135,10 @@ def _register(
         return _not_found(points_m, top, rack, config.rack)
     band = points_m[top.band_rows]
     spacing_m = point_spacing_m(band)
-    scan = remove_outliers(voxel_downsample(band, config.preprocess.rack_voxel_m), config.preprocess)
     coarse = too_coarse(spacing_m, rack, config.rack)
     if coarse:
         return RackPose(RackStatus.INSUFFICIENT, coarse, spacing_m=spacing_m)
+    scan = remove_outliers(voxel_downsample(band, config.preprocess.rack_voxel_m), config.preprocess)
     best, turned = _register_all(scan, top, rack, config.rack)
     margin_m = turned.inlier_rmse_m - best.inlier_rmse_m
     chosen, resolved_by = _choose_turn(best, turned, rack, config.rack, hint, intrinsics)

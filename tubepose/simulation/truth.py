@@ -9,13 +9,12 @@ from typing import Any
 import numpy as np
 import yaml
 
+from tubepose.capture.source import TRUTH_FOLDER
 from tubepose.errors import CaptureError
 from tubepose.labware.reading import read_yaml
 from tubepose.simulation.placement import pivot_height_m
 from tubepose.simulation.scene import PlacedTube, Scene
 from tubepose.transforms import FloatArray, tilt_rad
-
-TRUTH_FOLDER = "simulation_truth"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
