@@ -2,7 +2,7 @@
 
 from tubepose.labware.racks import RackModel, SlotModel
 from tubepose.labware.reading import Labware, catalogue, load_cap, load_rack, load_tube, read_labware
-from tubepose.labware.tubes import CapModel, TubeModel
+from tubepose.labware.tubes import CapModel, TubeModel, WallOptics
 
 __all__ = [
     "CapModel",
@@ -10,6 +10,7 @@ __all__ = [
     "RackModel",
     "SlotModel",
     "TubeModel",
+    "WallOptics",
     "catalogue",
     "load_cap",
     "load_rack",

@@ -18,6 +18,27 @@ from tubepose.transforms import FloatArray
 Material = Literal["opaque", "translucent", "transparent"]
 
 
+class WallOptics(Definition):
+    """What the plastic of a see-through wall does to light.
+
+    Attributes:
+        refractive_index: Of the plastic; 1.49 is usual for tubes.
+        scattering_per_mm: Scattering coefficient: 0 is clear, 1 is milky.
+        absorption_per_mm: Absorption coefficient.
+    """
+
+    refractive_index: float = Field(default=1.49, ge=1.0, le=2.5)
+    scattering_per_mm: NonNegative = 0.0
+    absorption_per_mm: NonNegative = 0.0
+
+
+# Assumptions: no published measurement of these walls is known to us; 0.4 per mm looks like polypropylene.
+DEFAULT_OPTICS = {
+    "translucent": WallOptics(scattering_per_mm=0.4, absorption_per_mm=0.005),
+    "transparent": WallOptics(scattering_per_mm=0.01, absorption_per_mm=0.002),
+}
+
+
 class TubeBody(Definition):
     """The body of a tube: a tapered wall with a bottom.
 
@@ -30,6 +51,7 @@ class TubeBody(Definition):
         cone_height_mm: Height of a conical bottom.
         cone_tip_diameter_mm: Diameter of the flat tip of a conical bottom.
         material: What light does to the wall.
+        optics: The wall's plastic in numbers, where they are known; else what its material stands for.
     """
 
     height_mm: Positive
@@ -40,9 +62,12 @@ class TubeBody(Definition):
     cone_height_mm: NonNegative = 0.0
     cone_tip_diameter_mm: NonNegative = 0.0
     material: Material
+    optics: WallOptics | None = None
 
     @model_validator(mode="after")
     def _check(self) -> TubeBody:
+        if self.optics is not None and self.material == "opaque":
+            raise ValueError("optics are those of a see-through wall, but the body's material is opaque")
         if 2 * self.wall_mm >= min(self.bottom_diameter_mm, self.top_diameter_mm):
             raise ValueError(f"wall_mm {self.wall_mm} leaves no room inside the body")
         if (self.bottom == "conical") != (self.cone_height_mm > 0):
@@ -55,6 +80,11 @@ class TubeBody(Definition):
     def bottom_height_mm(self) -> float:
         """Height of the bottom, where the wall begins."""
         return {"round": self.bottom_diameter_mm / 2, "conical": self.cone_height_mm, "flat": 0.0}[self.bottom]
+
+    @property
+    def wall_optics(self) -> WallOptics | None:
+        """The wall's plastic in numbers: as given, or as its material says; None for an opaque wall."""
+        return self.optics if self.optics is not None else DEFAULT_OPTICS.get(self.material)
 
 
 class TubeCap(Definition):

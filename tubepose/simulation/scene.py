@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from tubepose.labware import CapModel, RackModel, TubeModel
+from tubepose.labware import CapModel, RackModel, TubeModel, WallOptics
 from tubepose.simulation.meshes import Mesh, box, flat_polygon, merge, rack_shell, rack_wells, revolve
 from tubepose.transforms import FloatArray, make_transform
 
@@ -35,13 +35,16 @@ class Material:
 
     Attributes:
         albedo: Share of the light that is returned diffusely.
-        ambient: Share of the room's light that reaches it (less in a well).
-        plastic: Set for a see-through wall; its `albedo` is then the wall's own weak return.
+        ambient: Share of the room's light that reaches it (less in a well). Sensor `raycast` only.
+        plastic: Set for a see-through wall; its `albedo` is then the wall's own weak return. Sensor `raycast` only.
+        roughness: Roughness alpha of a glossy (GGX) coat of index 1.5; None for a matte surface. Sensor
+            `structured-light` only.
     """
 
     albedo: float
     ambient: float = 1.0
     plastic: Plastic | None = None
+    roughness: float | None = None
 
 
 # Assumptions, chosen to look plausible: no published measurement of this labware is known to us.
@@ -55,16 +58,91 @@ TRANSPARENT = Material(0.02, plastic=Plastic(1.49, 0.92))
 MATERIALS = {"opaque": OPAQUE_BODY, "translucent": TRANSLUCENT, "transparent": TRANSPARENT}
 
 
+@dataclass(frozen=True, slots=True)
+class Finishes:
+    """How the opaque surfaces of a scene return light; the colour of a tube's own cap is the tube's.
+
+    Attributes:
+        table: What the rack stands on.
+        rack: The rack's outside, wells and floors.
+        printed_cap: The printed caps.
+        opaque_body: Bodies of opaque tubes.
+        cap_roughness: Gloss of the tubes' own caps, as `Material.roughness`.
+        wall_roughness: Gloss of see-through walls for the projector's own light, as `Material.roughness`.
+    """
+
+    table: Material = TABLE
+    rack: Material = RACK
+    printed_cap: Material = PRINTED_CAP
+    opaque_body: Material = OPAQUE_BODY
+    cap_roughness: float | None = 0.35
+    wall_roughness: float = 0.15
+
+
+@dataclass(frozen=True, slots=True)
+class Liquid:
+    """What stands in a tube, up to a level surface.
+
+    Attributes:
+        level_m: Height of the surface on the tube's axis above the tube's origin.
+        refractive_index: 1.33 for water.
+        absorption_per_m: Absorption coefficient; it does not scatter.
+    """
+
+    level_m: float
+    refractive_index: float = 1.33
+    absorption_per_m: float = 5.0
+
+
+@dataclass(frozen=True, slots=True)
+class Label:
+    """A matte paper label on the outside of the wall.
+
+    Attributes:
+        low_m: Height of its lower edge above the tube's origin.
+        high_m: Height of its upper edge.
+        start_rad: Where it begins around the tube's axis, from the tube's x axis towards y.
+        span_rad: How far it goes around, at most a full turn.
+        albedo: Share of the light that it returns, on both sides.
+    """
+
+    low_m: float
+    high_m: float
+    start_rad: float
+    span_rad: float
+    albedo: float = 0.8
+
+
+@dataclass(frozen=True, slots=True)
+class CapFit:
+    """How a tube's own closed cap differs from its definition; an open flange is part of the body and does not.
+
+    Attributes:
+        tilt_rad: Turn about the tube's x and y axes, at the centre of the rim.
+        radius_error_m: Added to the cap's radius.
+        height_error_m: The whole cap sits higher by this.
+    """
+
+    tilt_rad: tuple[float, float] = (0.0, 0.0)
+    radius_error_m: float = 0.0
+    height_error_m: float = 0.0
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class PlacedTube:
     """A tube that stands in a slot.
 
     Attributes:
         slot: Name of the slot.
-        model: Its definition.
-        T_rack_tube: Array of shape (4, 4); maps tube points to rack points, metres.
+        model: Its definition: what an estimator knows of it.
+        T_rack_tube: Array of shape (4, 4); maps points of the body to rack points, metres. It is the body's.
         cap_spin_rad: Turn of its printed cap about the tube's axis, from the tube's x axis.
         cap_albedo: Brightness of its own cap.
+        cap_fit: How its own cap differs from its definition.
+        printed_tilt_rad: Turn of its printed cap about the tube's x and y axes, at the rim's centre.
+        optics: The plastic of its wall, where it is not the definition's.
+        liquid: What stands in it, if anything.
+        label: The label on it, if any.
     """
 
     slot: str
@@ -72,11 +150,39 @@ class PlacedTube:
     T_rack_tube: FloatArray
     cap_spin_rad: float = 0.0
     cap_albedo: float = 0.6
+    cap_fit: CapFit = CapFit()
+    printed_tilt_rad: tuple[float, float] = (0.0, 0.0)
+    optics: WallOptics | None = None
+    liquid: Liquid | None = None
+    label: Label | None = None
+
+    @property
+    def wall_optics(self) -> WallOptics | None:
+        """The plastic of its wall in numbers; None for an opaque body."""
+        own = self.model.body.wall_optics
+        return own if own is None or self.optics is None else self.optics
 
     @property
     def T_tube_cap(self) -> FloatArray:  # noqa: N802
-        """Pose of the printed cap that the tube wears, shape (4, 4)."""
-        return make_transform(Rotation.from_euler("z", self.cap_spin_rad).as_matrix(), np.zeros(3))
+        """Pose of the printed cap that the tube wears, shape (4, 4); its heights count from the tube's origin."""
+        spin = make_transform(Rotation.from_euler("z", self.cap_spin_rad).as_matrix(), np.zeros(3))
+        return self._tilted_at_rim(self.printed_tilt_rad, 0.0) @ spin
+
+    @property
+    def T_tube_own_cap(self) -> FloatArray:  # noqa: N802
+        """Pose of the tube's own closed cap, shape (4, 4); its heights count from the tube's origin."""
+        return self._tilted_at_rim(self.cap_fit.tilt_rad, self.cap_fit.height_error_m)
+
+    def own_cap_profile_m(self) -> FloatArray:
+        """Profile (z, r) of its own cap as made, in the frame of `T_tube_own_cap`, metres."""
+        profile = self.model.cap_profile_m()
+        profile[1:3, 1] += self.cap_fit.radius_error_m
+        return profile
+
+    def _tilted_at_rim(self, tilt_rad: tuple[float, float], up_m: float) -> FloatArray:
+        rotation = Rotation.from_rotvec([*tilt_rad, 0.0]).as_matrix()
+        rim = np.array([0.0, 0.0, self.model.rim_height_m])
+        return make_transform(rotation, rim - rotation @ rim + np.array([0.0, 0.0, up_m]))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -88,7 +194,9 @@ class Scene:
         T_camera_rack: Array of shape (4, 4); maps rack points to camera points, metres.
         tubes: The tubes in its slots.
         printed_cap: The cap that all tubes wear instead of their own, or None.
-        materials: How the walls of bodies and flanges return light, by the material's name in the labware files.
+        materials: How the walls of bodies and flanges return light, by the material's name in the labware files. Sensor
+            `raycast` only.
+        finishes: How the opaque surfaces return light.
     """
 
     rack: RackModel
@@ -96,11 +204,12 @@ class Scene:
     tubes: tuple[PlacedTube, ...]
     printed_cap: CapModel | None = None
     materials: dict[str, Material] | None = None
+    finishes: Finishes = Finishes()
 
     def parts(self) -> Iterator[tuple[Mesh, Material]]:
         """Every solid of the scene with its material, camera frame."""
         corners = np.array([[1, 1], [-1, 1], [-1, -1], [1, -1]]) * TABLE_HALF_SIZE_M
-        yield flat_polygon([corners], 0.0).transformed(self.T_camera_rack), TABLE
+        yield flat_polygon([corners], 0.0).transformed(self.T_camera_rack), self.finishes.table
         yield rack_shell(self.rack).transformed(self.T_camera_rack), RACK
         yield rack_wells(self.rack).transformed(self.T_camera_rack), RACK_WELL
         for tube in self.tubes:
