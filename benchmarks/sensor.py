@@ -28,8 +28,8 @@ from tubepose.provenance import pinned_threads
 from tubepose.rack import register_rack
 from tubepose.simulation import raycast
 from tubepose.simulation.camera import NoiseModel, default_camera
+from tubepose.simulation.random_scene import random_scene
 from tubepose.simulation.scene import PlacedTube, Scene
-from tubepose.simulation.sessions import make_scene
 from tubepose.transforms import FloatArray, invert_transform, tilt_rad, transform_points
 
 TUBES = ("chen2023-tube-1", "chen2023-tube-2", "chen2023-tube-3")
@@ -50,7 +50,7 @@ def shoot(scene: Scene, shared_mm: float, seed: int) -> FloatArray:
 
 def scene_of(rack: RackModel, tube: TubeModel, seed: int) -> Scene:
     """A seeded scene with one type of tube."""
-    return make_scene(rack, [tube], load_cap(CAP), default_camera(), np.random.default_rng(seed))
+    return random_scene(rack, [tube], load_cap(CAP), default_camera(), np.random.default_rng(seed))
 
 
 def scatter_mm(points_m: FloatArray, T_camera_rack: FloatArray, rack: RackModel, away: bool) -> list[float]:
@@ -109,8 +109,8 @@ def cap_table(rack: RackModel, seeds: int) -> pd.DataFrame:
             scene = dataclasses.replace(scene_of(rack, tube, seed), printed_cap=cap)
             cloud = shoot(scene, shared, seed).reshape(-1, 3)
             for placed in scene.tubes:
-                T = scene.T_camera_rack @ placed.T_rack_tube
-                local = transform_points(invert_transform(T @ placed.T_tube_cap), cloud) - [0, 0, cap.offset_m(tube)]
+                T = scene.T_camera_rack @ placed.T_rack_tube @ placed.T_tube_cap
+                local = transform_points(invert_transform(T), cloud) - [0, 0, cap.offset_m(tube)]
                 inner = np.abs(local[:, :2]).max(axis=1) < cap.square_m / 2 - CAP_MARGIN_M
                 plane = plane_frame(cloud[inner & (np.abs(local[:, 2]) < OFF_M)])
                 errors.append(np.rad2deg(tilt_rad(plane[:3, 2], T[:3, 2])))

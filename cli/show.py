@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import itertools
 import sys
+import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -14,17 +16,57 @@ if TYPE_CHECKING:
     import pandas as pd
 
 
+LINE_SECONDS = 60.0
+"""Without a terminal, progress is one line in this time; a command that is done sooner says nothing."""
+
+
 @contextmanager
 def progress(title: str, total: int) -> Iterator[Callable[[], None]]:
-    """A progress bar on stderr while it is a terminal; otherwise nothing. Yields the step function."""
+    """Progress on stderr, see `counted_progress`. Yields the step function."""
+    done = itertools.count(1)
+    with counted_progress(title) as show:
+        show(0, total)
+        yield lambda: show(next(done), total)
+
+
+@contextmanager
+def counted_progress(title: str) -> Iterator[Callable[[int, int], None]]:
+    """Progress on stderr: a bar while it is a terminal, otherwise a line now and then; both with the time left.
+
+    Yields the function that takes the number done and the number in all.
+    """
+    if not sys.stderr.isatty():
+        yield _Lines(title)
+        return
     from rich.console import Console
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-    console = Console(stderr=True)
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    with Progress(*columns, console=console, disable=not sys.stderr.isatty(), transient=True) as bar:
-        task = bar.add_task(title, total=total)
-        yield lambda: bar.advance(task)
+    with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
+        task = bar.add_task(title, total=None)
+        yield lambda done, total: bar.update(task, completed=done, total=total)
+
+
+class _Lines:
+    """Progress where nobody watches a bar: a line a minute, so that a log shows that it goes on and until when."""
+
+    def __init__(self, title: str) -> None:
+        self.title = title
+        self.begun = self.told = time.monotonic()
+
+    def __call__(self, done: int, total: int) -> None:
+        now = time.monotonic()
+        if done == 0 or done == total or now - self.told < LINE_SECONDS:
+            return
+        self.told = now
+        say(f"{self.title}: {done}/{total}, about {_duration((now - self.begun) / done * (total - done))} left")
+
+
+def _duration(seconds: float) -> str:
+    """A time in the unit that a person would use."""
+    if seconds < 100:
+        return f"{seconds:.0f} s"
+    return f"{seconds / 60:.0f} min" if seconds < 6000 else f"{seconds / 3600:.1f} h"
 
 
 def say(text: str) -> None:

@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+import os
+import re
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
+
+if TYPE_CHECKING:
+    from tubepose.simulation import SceneVariation
 
 
 def simulate(
@@ -14,39 +19,92 @@ def simulate(
     tubes: Annotated[str, typer.Option(help="Tubes, names or files, with commas.")],
     trials: Annotated[int, typer.Option(min=1, help="Trials per kind of tube.")] = 2,
     seed: Annotated[int, typer.Option(min=0, help="The same seed gives the same bytes.")] = 0,
-    sensor: Annotated[str, typer.Option(help="Sensor model: raycast.")] = "raycast",
+    sensor: Annotated[str, typer.Option(help="Sensor model: raycast or structured-light.")] = "raycast",
     resolution: Annotated[int, typer.Option(min=64, max=2064, help="Side of the square image, pixels.")] = 1376,
     cap: Annotated[str, typer.Option(help="Printed cap of the ground truth.")] = "printed-square-16.7",
-    fill: Annotated[
-        float | None, typer.Option(min=0.0, max=1.0, help="Share of occupied slots; default: 0.1 to 0.4.")
-    ] = None,
     mixed: Annotated[bool, typer.Option("--mixed", help="All kinds of tube in every trial.")] = False,
+    scenes: Annotated[Path | None, typer.Option(help="YAML file of what varies; see docs/simulation.md.")] = None,
+    fill: Annotated[
+        str | None, typer.Option(metavar="SHARE", help="Occupied slots: 0.3 or 0.1-0.4, which is the default.")
+    ] = None,
+    scattering: Annotated[
+        str | None, typer.Option(metavar="RANGE", help="Of see-through walls, per mm: 0.4 or 0-1.")
+    ] = None,
+    liquid: Annotated[float | None, typer.Option(metavar="SHARE", help="Share of the tubes that hold liquid.")] = None,
+    labels: Annotated[float | None, typer.Option(metavar="SHARE", help="Share of the tubes with a label.")] = None,
+    perfect_parts: Annotated[bool, typer.Option("--perfect-parts", help="Caps exactly as defined and seated.")] = False,
+    no_calibration_error: Annotated[
+        bool, typer.Option("--no-calibration-error", help="A camera that is calibrated exactly.")
+    ] = False,
     capture_format: Annotated[
         Literal["folder", "mcap"], typer.Option("--format", help="Kind of capture files.")
     ] = "folder",
+    threads: Annotated[int, typer.Option(min=0, help="0: one per core. They change no byte.")] = 0,
 ) -> None:
     """Make a SIMULATED session like the paper's: printed and original caps, exact truth apart."""
     from tubepose.errors import CaptureError, ConfigError
     from tubepose.labware import load_cap, load_rack
-    from tubepose.provenance import pinned_threads
     from tubepose.simulation import SENSORS, simulate_session
     from tubepose_cli.inputs import read_tubes, unknown_name
-    from tubepose_cli.show import progress, say
+    from tubepose_cli.show import counted_progress, say
 
     if sensor not in SENSORS:
         raise ConfigError(unknown_name("sensor", sensor, SENSORS))
     models = read_tubes(tubes)
     if not models:
         raise ConfigError("--tubes names no tube; see 'tubepose labware list'")
+    variation = _variation(scenes, fill, scattering, liquid, labels, perfect_parts)
     total = 2 * trials * (1 if mixed else len(models))
     rack_model, cap_model = load_rack(rack), load_cap(cap)
     try:
-        with pinned_threads(0), progress("simulated captures", total) as step:
+        with counted_progress("simulated captures") as show:
             simulate_session(
-                out, rack_model, models, trials=trials, seed=seed, cap=cap_model, sensor=sensor,
-                resolution=resolution, fill=fill, mixed=mixed, capture_format=capture_format,
-                progress=lambda _done, _total: step(),
+                out, rack_model, models, trials=trials, seed=seed, cap=cap_model, sensor=sensor, resolution=resolution,
+                variation=variation, mixed=mixed, calibration_error=not no_calibration_error,
+                capture_format=capture_format, threads=threads or available_cores(), progress=show,
             )  # fmt: skip
     except OSError as problem:
         raise CaptureError(f"{out}: cannot be written ({problem.strerror}); choose another place") from None
     say(f"{out}: {total} simulated captures in {total // 2} trials; next: tubepose bench {out} --out RESULTS")
+
+
+def available_cores() -> int:
+    """Cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def _variation(
+    scenes: Path | None,
+    fill: str | None,
+    scattering: str | None,
+    liquid: float | None,
+    labels: float | None,
+    perfect_parts: bool,
+) -> SceneVariation:
+    """What varies: a flag before the file, the file before the default."""
+    from tubepose.simulation import SceneVariation, load_scene_variation
+    from tubepose.simulation.variation import Tolerances, scene_variation
+
+    base = SceneVariation() if scenes is None else load_scene_variation(scenes)
+    flags: dict[str, tuple[str, Any]] = {
+        "--fill": ("fill", fill and _range("--fill", fill)),
+        "--scattering": ("scattering_per_mm", scattering and _range("--scattering", scattering)),
+        "--liquid": ("liquid_share", liquid),
+        "--labels": ("label_share", labels),
+        "--perfect-parts": ("tolerances", dict.fromkeys(Tolerances.model_fields, 0.0) if perfect_parts else None),
+    }
+    for flag, (key, value) in flags.items():
+        if value is not None:
+            base = scene_variation(base.model_dump() | {key: value}, flag)
+    return base
+
+
+def _range(flag: str, text: str) -> tuple[float, float]:
+    """``0.3`` or ``0.1-0.4``."""
+    from tubepose.errors import ConfigError
+
+    number = r"(\d+\.?\d*|\.\d+)"
+    found = re.fullmatch(f"{number}(?:-{number})?", text)
+    if found is None:
+        raise ConfigError(f"{flag} {text}: expected a number or a range, for example 0.3 or 0.1-0.4")
+    return float(found[1]), float(found[2] or found[1])

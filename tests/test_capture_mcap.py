@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import struct
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -15,6 +16,7 @@ from mcap_ros2.writer import Writer
 
 from tubepose.capture import CameraIntrinsics, RgbdFrame, open_captures, write_mcap
 from tubepose.capture import mcap_writing as writing
+from tubepose.capture.compressed_depth import FORMAT, decode_compressed_depth, encode_compressed_depth
 from tubepose.capture.ros import CAMERA_INFO, COMPRESSED_IMAGE, IMAGE, POINT_CLOUD, camera_of, cloud_arrays, image_array
 from tubepose.errors import CaptureError
 
@@ -82,12 +84,14 @@ GRAY = np.arange(24 * 32, dtype=np.uint16).reshape(24, 32).astype(np.uint8)
 @pytest.mark.parametrize("gray", [False, True])
 def test_frames_survive_the_round_trip(tmp_path, as_depth, compressed, gray):
     frames = [make_frame(seed, image=GRAY) if gray else make_frame(seed) for seed in range(3)]
-    write_mcap(tmp_path / "shots.mcap", frames, as_depth=as_depth, compressed=compressed)
+    write_mcap(tmp_path / "shots.mcap", frames, as_depth=as_depth, compressed=compressed, picture="png")
+    # Compressed depth of 1.2 m is off by up to half a step of 0.05 mm, and x and y with it.
+    tolerance = 2.6e-5 if as_depth and compressed else 1e-7
     again = read_all(tmp_path / "shots.mcap")
     assert [frame.timestamp_ns for frame in again] == [STAMP_NS + i * SECOND_NS for i in range(3)]
     assert [(frame.capture, frame.index) for frame in again] == [("shots", 0), ("shots", 1), ("shots", 2)]
     for frame, found in zip(frames, again, strict=True):
-        np.testing.assert_allclose(found.cloud_m, frame.cloud_m, atol=1e-7)
+        np.testing.assert_allclose(found.cloud_m, frame.cloud_m, rtol=0, atol=tolerance)
         np.testing.assert_array_equal(found.image, frame.image)
         assert (found.intrinsics, found.organised, found.sensor, found.simulated) == (CAMERA, True, "PhoXi M", True)
 
@@ -102,9 +106,10 @@ def test_frame_of_a_cloud_alone_survives(tmp_path):
     assert (again.timestamp_ns, again.simulated) == (None, False)
 
 
-def test_same_frames_give_same_bytes_and_nothing_partial(tmp_path):
+@pytest.mark.parametrize("compressed", [False, True])
+def test_same_frames_give_same_bytes_and_nothing_partial(tmp_path, compressed):
     for name in ("a.mcap", "b.mcap"):
-        write_mcap(tmp_path / name, [make_frame(0), make_frame(1)])
+        write_mcap(tmp_path / name, [make_frame(0), make_frame(1)], as_depth=compressed, compressed=compressed)
     assert (tmp_path / "a.mcap").read_bytes() == (tmp_path / "b.mcap").read_bytes()
     with pytest.raises(CaptureError, match="frame 1 cannot be written as a depth image"):
         write_mcap(tmp_path / "c.mcap", [make_frame(0), make_frame(1, intrinsics=None)], as_depth=True)
@@ -252,6 +257,136 @@ def test_distorted_image_is_no_pinhole_image():
     assert camera_of(info, rectified=False) is None
 
 
+# Compressed depth ----------------------------------------------------------------------------------------------------
+
+
+def ros_inverse_depth(depth: np.ndarray, quantization: float = 100.0, farthest: float = 10.0) -> bytes:
+    """Data of a message as compressed_depth_image_transport makes it of 32FC1, with its default parameters."""
+    a = quantization * (quantization + 1)
+    b = 1 - a / farthest
+    counts = np.where(depth < farthest, a / depth + b, 0).astype(np.uint16)
+    return struct.pack("<iff", 0, a, b) + cv2.imencode(".png", counts)[1].tobytes()
+
+
+def raw_depth(counts: np.ndarray) -> bytes:
+    return struct.pack("<iff", 0, 0.0, 0.0) + cv2.imencode(".png", counts)[1].tobytes()
+
+
+def depth_message(data: bytes, form: str = FORMAT) -> list[tuple[str, str, dict[str, Any]]]:
+    return [
+        ("/camera/depth/image_raw/compressedDepth", COMPRESSED_IMAGE, header() | {"format": form, "data": data}),
+        ("/camera/depth/camera_info", CAMERA_INFO, info_message()),
+    ]
+
+
+@pytest.mark.parametrize("form", [FORMAT, "32FC1; compressedDepth", "32FC1;compressedDepth png "])
+def test_inverse_depth_as_ros_writes_it(tmp_path, form):
+    depth = np.random.default_rng(0).uniform(0.5, 1.2, (24, 32))
+    depth[0, 0], depth[0, 1] = np.nan, 11.0
+    (frame,) = read_all(record(tmp_path / "a.mcap", depth_message(ros_inverse_depth(depth), form)))
+    assert np.isnan(frame.cloud_m[0, :2]).all()
+    assert frame.intrinsics == CAMERA
+    # ROS cuts the fraction of a count off: up to one step, 1.44 / 10100 m at 1.2 m, too far.
+    off = (frame.cloud_m[..., 2] - depth)[1:]
+    assert -1e-6 < off.min() < off.max() < 1.2**2 / 10100 * 1.01
+
+
+@pytest.mark.parametrize("form", ["16UC1; compressedDepth png", "16UC1; compressedDepth"])
+def test_compressed_depth_of_16_bits_is_in_millimetres(tmp_path, form):
+    counts = np.arange(500, 500 + 24 * 32, dtype=np.uint16).reshape(24, 32)
+    counts[0, 0], counts[0, 1] = 0, 65535
+    (frame,) = read_all(record(tmp_path / "a.mcap", depth_message(raw_depth(counts), form)))
+    assert np.isnan(frame.cloud_m[0, :2]).all()
+    np.testing.assert_allclose(frame.cloud_m[1:, :, 2], counts[1:] / 1000)
+
+
+def test_the_raw_depth_goes_before_its_compressed_twin(tmp_path):
+    raw = image_message(np.full((24, 32), 0.9, np.float32), "32FC1")
+    compressed = depth_message(ros_inverse_depth(np.full((24, 32), 0.5)))
+    path = record(tmp_path / "a.mcap", [("/camera/depth/image_raw", IMAGE, raw), *compressed])
+    np.testing.assert_allclose(read_all(path)[0].cloud_m[..., 2], 0.9)
+    (frame,) = read_all(path, depth_topic=compressed[0][0])
+    np.testing.assert_allclose(frame.cloud_m[..., 2], 0.5, atol=1e-4)
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    near=st.floats(0.35, 1.1),
+    span=st.floats(0, 0.75),
+    step_m=st.floats(4e-5, 1e-3),
+    seed=st.integers(0, 99),
+)
+def test_compressed_depth_comes_back_within_half_a_step(near, span, step_m, seed):
+    depth = np.random.default_rng(seed).uniform(near, min(near + span, 1.1), (5, 7))
+    depth[2, 3] = np.nan
+    again = decode_compressed_depth(FORMAT, encode_compressed_depth(depth, "here", step_m), "here")
+    np.testing.assert_array_equal(np.isnan(again), np.isnan(depth))
+    far = np.nanmax(depth)
+    assert (np.abs(again - depth) <= 0.501 * step_m * (depth / far) ** 2 + 1e-7)[np.isfinite(depth)].all()
+
+
+def test_a_frame_without_any_point_can_be_compressed():
+    nothing = np.full((3, 4), np.nan)
+    again = decode_compressed_depth(FORMAT, encode_compressed_depth(nothing, "here"), "here")
+    np.testing.assert_array_equal(again, nothing)
+
+
+def test_depth_that_16_bits_do_not_hold_is_refused_with_a_step_that_works(tmp_path):
+    depth = np.full((24, 32), 0.2)
+    depth[0, 0] = 3.0
+    frame = make_frame(cloud_m=CAMERA.backproject(depth))
+    with pytest.raises(CaptureError, match=r"frame 0: depth from 0\.200 to 3\.000 m .* allow a step of 0\.64 mm"):
+        write_mcap(tmp_path / "a.mcap", [frame], as_depth=True, compressed=True)
+    write_mcap(tmp_path / "a.mcap", [frame], as_depth=True, compressed=True, depth_step_m=0.65e-3)
+    assert abs(read_all(tmp_path / "a.mcap")[0].cloud_m[..., 2] - depth).max() < 0.33e-3
+
+
+WHOLE = ros_inverse_depth(np.full((24, 32), 0.7))
+
+
+@pytest.mark.parametrize(
+    ("form", "data", "message"),
+    [
+        (FORMAT, b"", "holds 0 bytes, expected a header of 12 bytes and a PNG"),
+        (FORMAT, WHOLE[:12], "holds 12 bytes, expected a header of 12 bytes and a PNG"),
+        (FORMAT, WHOLE[:-8], "truncated; expected a whole PNG"),
+        (FORMAT, WHOLE[:12] + b"nothing", "cannot be decoded; expected a whole PNG"),
+        (FORMAT, struct.pack("<iff", 0, np.nan, 0.0) + WHOLE[12:], "A = nan and B = 0; expected numbers with A above"),
+        (FORMAT, struct.pack("<iff", 0, 0.0, 0.0) + WHOLE[12:], "A = 0 and B = 0; expected numbers with A above 0"),
+        (FORMAT, raw_depth(np.zeros((24, 32), np.uint8)), "16 bits and 1 channel, found 8 bits"),
+        (FORMAT, ros_inverse_depth(np.full((12, 16), 0.7)), "depth image is 16 x 12 pixels, its CameraInfo 32 x 24"),
+        ("16UC1; compressedDepth rvl", WHOLE, "format '16UC1; compressedDepth rvl' is not read; expected .* as png"),
+        ("8UC1; compressedDepth png", WHOLE, "format '8UC1; compressedDepth png' is not read"),
+    ],
+)
+def test_compressed_depth_that_cannot_be_read_is_one_line(tmp_path, form, data, message):
+    path = record(tmp_path / "a.mcap", depth_message(data, form))
+    with pytest.raises(CaptureError, match=message) as caught:
+        read_all(path)
+    assert "\n" not in str(caught.value)
+    assert "/camera/depth/image_raw/compressedDepth, message 1" in str(caught.value)
+
+
+def test_compressed_depth_is_no_picture(tmp_path):
+    messages = depth_message(WHOLE)
+    with pytest.raises(CaptureError, match="is the depth that the frames are made of; name a picture"):
+        read_all(record(tmp_path / "a.mcap", messages), image_topic=messages[0][0])
+    with pytest.raises(CaptureError, match="a compressed depth image is no picture"):
+        read_all(record(tmp_path / "a.mcap", [*clouds([0]), *messages]), image_topic=messages[0][0])
+
+
+def test_jpeg_pictures_are_nearly_the_same_and_smaller(tmp_path):
+    rng = np.random.default_rng(0)
+    smooth = cv2.resize(rng.integers(60, 200, (4, 5, 3)).astype(np.uint8), (32, 24), interpolation=cv2.INTER_CUBIC)
+    noisy = np.clip(smooth + rng.normal(0, 2, smooth.shape), 0, 255).astype(np.uint8)
+    for picture in ("png", "jpeg"):
+        write_mcap(tmp_path / f"{picture}.mcap", [make_frame(image=noisy)], compressed=True, picture=picture)
+    (frame,) = read_all(tmp_path / "jpeg.mcap")
+    assert np.abs(frame.image.astype(int) - noisy).mean() < 4
+    assert np.abs(frame.image.astype(int) - smooth).mean(axis=(0, 1)).max() < 4
+    assert (tmp_path / "jpeg.mcap").stat().st_size < (tmp_path / "png.mcap").stat().st_size
+
+
 # Pairing and registration --------------------------------------------------------------------------------------------
 
 
@@ -386,7 +521,7 @@ def test_depth_without_camera_info_is_refused(tmp_path):
 
 def test_pictures_alone_make_no_frame(tmp_path):
     path = record(tmp_path / "a.mcap", [("/texture", IMAGE, image_message(GRAY, "mono8"))])
-    with pytest.raises(CaptureError, match=r"expected a PointCloud2, or an Image of 16UC1 .* found /texture"):
+    with pytest.raises(CaptureError, match=r"expected a PointCloud2, or 16UC1 .* found /texture"):
         read_all(path)
 
 

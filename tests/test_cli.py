@@ -8,6 +8,7 @@ import re
 import shutil
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -27,8 +28,9 @@ from tubepose.detection.geometric import GeometricDetector
 from tubepose.evaluation import AXES
 from tubepose.labware import load_rack, load_tube
 from tubepose.records import ESTIMATE_COLUMNS, POSE_COLUMNS, RACK_COLUMNS, SLOT_COLUMNS, TIMING_COLUMNS
+from tubepose.simulation import SceneVariation
 from tubepose.transforms import FloatArray
-from tubepose_cli.show import describe_tubes
+from tubepose_cli.show import describe_tubes, progress
 
 KNOWN = ("--rack", SMALL_RACK, "--tubes", SMALL_TUBES[1])
 DOCS = Path(__file__).parents[1] / "docs" / "outputs.md"
@@ -427,11 +429,21 @@ def test_a_wrong_option_is_one_line(
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (("out", "--sensor", "raycst"), "unknown sensor 'raycst'; did you mean 'raycast'?; known: raycast"),
+        (
+            ("out", "--sensor", "raycst"),
+            "unknown sensor 'raycst'; did you mean 'raycast'?; known: raycast, structured-light",
+        ),
         (("out", "--cap", "printed-square"), "unknown cap 'printed-square'; did you mean 'printed-square-16.7'?"),
         (("out", "--tubes", ","), "--tubes names no tube; see 'tubepose labware list'"),
         (("out", "--tubes", "centrifuge-50ml-conical"), "cannot stand in rack 'round-10ml-3x4'"),
-        (("out", "--fill", "0"), "fill is 0; expected a share"),
+        (
+            ("out", "--fill", "1.5"),
+            "--fill: fill: expected [least, most] with 0 <= least <= most <= 1, found [1.5, 1.5]",
+        ),
+        (("out", "--fill", "0.4-0.1"), "--fill: fill: expected [least, most]"),
+        (("out", "--fill", "some"), "--fill some: expected a number or a range, for example 0.3 or 0.1-0.4"),
+        (("out", "--liquid", "2"), "--liquid: liquid_share: Input should be less than or equal to 1"),
+        (("out", "--scenes", "nowhere.yaml"), "nowhere.yaml: no such file"),
         (("file",), "file: there is something already"),
         (("file/out",), "file/out: cannot be written"),
     ],
@@ -488,6 +500,8 @@ def test_simulate_gives_the_same_bytes_for_the_same_seed(tmp_path: Path) -> None
         "1",
         "--resolution",
         "128",
+        "--threads",
+        "1",
     )
     for name, seed in (("one", "5"), ("two", "5"), ("other", "6")):
         ended = tubepose("simulate", tmp_path / name, *options, "--seed", seed)
@@ -497,6 +511,42 @@ def test_simulate_gives_the_same_bytes_for_the_same_seed(tmp_path: Path) -> None
     assert "session.yaml" in one
     assert not set(one.values()) & {other["session.yaml"], *(v for k, v in other.items() if k.endswith("depth.png"))}
     assert {path.name for path in tmp_path.iterdir()} == {"one", "two", "other"}
+
+
+def test_a_flag_goes_before_the_file_and_the_file_before_the_default(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked: dict[str, Any] = {}
+    monkeypatch.setattr("tubepose.simulation.simulate_session", lambda *_places, **options: asked.update(options))
+    (tmp_path / "scenes.yaml").write_text(
+        "fill: [0.1, 1.0]\nlabel_share: 0.3\nscattering_per_mm: [0, 1]\ntolerances: {cap_tilt_deg: 2.0}\n"
+    )
+    session = ("simulate", tmp_path / "out", "--rack", SMALL_RACK, "--tubes", SMALL_TUBES[0])
+    flags = ("--fill", "0.3", "--scattering", "0.2-.5", "--liquid", "0.4", "--perfect-parts", "--no-calibration-error")
+    ended = tubepose(*session, "--scenes", tmp_path / "scenes.yaml", *flags, "--threads", "3")
+    assert ended.code == 0, ended.err
+    given = asked["variation"]
+    assert (given.fill, given.scattering_per_mm, given.liquid_share) == ((0.3, 0.3), (0.2, 0.5), 0.4)
+    assert (given.label_share, given.table_albedo) == (0.3, (0.15, 0.15))
+    assert set(given.tolerances.model_dump().values()) == {0.0}
+    assert (asked["threads"], asked["calibration_error"], asked["sensor"]) == (3, False, "raycast")
+    assert tubepose(*session).code == 0
+    assert asked["variation"] == SceneVariation()
+    assert (asked["threads"] >= 1, asked["calibration_error"]) == (True, True)
+
+
+def test_progress_without_a_terminal_is_a_line_now_and_then(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    clock = iter([0.0, 20.0, 61.0, 90.0, 7000.0, 7100.0])
+    monkeypatch.setattr("tubepose_cli.show.time.monotonic", lambda: next(clock))
+    with progress("captures", 4) as step:
+        for _ in range(4):
+            step()
+    assert capsys.readouterr().err.splitlines() == [
+        "captures: 1/4, about 3 min left",
+        "captures: 3/4, about 39 min left",
+    ]
 
 
 def test_bench_gives_the_same_bytes_twice(benched: tuple[Path, Ended], small_session: Path, tmp_path: Path) -> None:
@@ -512,7 +562,7 @@ def test_bench_gives_the_same_bytes_twice(benched: tuple[Path, Ended], small_ses
 def test_recordings_give_the_same_slots_and_truth_as_folders(benched: tuple[Path, Ended], tmp_path: Path) -> None:
     ended = tubepose(
         "simulate", tmp_path / "s", "--rack", SMALL_RACK, "--tubes", ",".join(SMALL_TUBES), "--trials", "1",
-        "--seed", "3", "--resolution", "400", "--fill", "0.2", "--format", "mcap",
+        "--seed", "9", "--resolution", "400", "--fill", "0.2", "--format", "mcap", "--threads", "1",
     )  # fmt: skip
     assert ended.code == 0
     assert {path.suffix for path in (tmp_path / "s" / "captures").iterdir()} == {".mcap"}

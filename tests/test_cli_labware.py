@@ -154,7 +154,7 @@ def test_version() -> None:
 
 def test_help_names_every_command() -> None:
     out = runner.invoke(main.app, ["--help"]).stdout
-    for name in ("estimate", "gt", "bench", "simulate", "labware"):
+    for name in ("estimate", "gt", "bench", "simulate", "labware", "data"):
         assert name in out
 
 

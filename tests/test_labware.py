@@ -27,7 +27,7 @@ from tubepose.labware import (
 )
 from tubepose.labware.drawing import draw_labware
 from tubepose.labware.racks import SlotGrid
-from tubepose.labware.tubes import TubeBody, TubeCap
+from tubepose.labware.tubes import TubeBody, TubeCap, WallOptics
 
 TUBES = [item for item in catalogue().values() if isinstance(item, TubeModel)]
 RACKS = [item for item in catalogue().values() if isinstance(item, RackModel)]
@@ -247,6 +247,9 @@ def test_slot_names_are_unique(tmp_path: Path) -> None:
         (tube_data(bottom="conical"), "cone_height_mm goes with"),
         (tube_data(height_mm=6), "the bottom is higher"),
         (tube_data() | {"cap": {"diameter_mm": 15, "height_mm": 5, "top_mm": 0}}, "cap diameter_mm 15.0 is not more"),
+        (tube_data(optics={"scattering_per_mm": 0.4}), "optics are those of a see-through wall"),
+        (tube_data(material="translucent", optics={"refractive_index": 0.9}), r"body\.optics\.refractive_index.*0\.9"),
+        (tube_data(material="translucent", optics={"scattering": 0.4}), r"unknown key 'body\.optics\.scattering'"),
         (tube_data() | {"cap": {"diameter_mm": 18, "height_mm": 99, "top_mm": 1}}, "reaches below the body's wall"),
         (tube_data() | {"cap": {"diameter_mm": 18, "height_mm": 5, "top_mm": 1, "open": True}}, "top_mm must be 0"),
     ],
@@ -254,6 +257,20 @@ def test_slot_names_are_unique(tmp_path: Path) -> None:
 def test_wrong_tubes_are_refused(tmp_path: Path, data: dict[str, object], message: str) -> None:
     with pytest.raises(LabwareError, match=message):
         read_labware(written(tmp_path, yaml.safe_dump(data)))
+
+
+def test_optics_of_a_wall_are_given_or_those_of_its_material(tmp_path: Path) -> None:
+    walls = {
+        name: read_labware(written(tmp_path, yaml.safe_dump(tube_data(**body)))).body.wall_optics
+        for name, body in {
+            "opaque": {},
+            "translucent": {"material": "translucent"},
+            "clear": {"material": "transparent", "optics": {"refractive_index": 1.57}},
+        }.items()
+    }
+    assert walls["opaque"] is None
+    assert walls["translucent"] == WallOptics(refractive_index=1.49, scattering_per_mm=0.4, absorption_per_mm=0.005)
+    assert walls["clear"] == WallOptics(refractive_index=1.57, scattering_per_mm=0, absorption_per_mm=0)
 
 
 def test_a_sunken_cap_is_refused(tmp_path: Path) -> None:
@@ -302,7 +319,7 @@ def test_the_examples_in_the_docs_are_valid(tmp_path: Path) -> None:
     assert len(examples[0].splitlines()) == 10
 
 
-@pytest.mark.parametrize("model", [RackModel, SlotGrid, SlotModel, TubeModel, TubeBody, TubeCap, CapModel])
+@pytest.mark.parametrize("model", [RackModel, SlotGrid, SlotModel, TubeModel, TubeBody, WallOptics, TubeCap, CapModel])
 def test_every_key_is_in_the_docs(model: type[BaseModel]) -> None:
     words = set(re.findall(r"[a-z_]+", " ".join(re.findall(r"`([^`\n]*)`", DOCS))))
     assert not set(model.model_fields) - words

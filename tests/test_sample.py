@@ -9,7 +9,7 @@ import pandas as pd
 import pytest
 
 from tubepose.batch import run_jobs, session_jobs
-from tubepose.capture.manifest import read_manifest, verify_manifest
+from tubepose.capture.manifest import check_data_set, read_manifest
 from tubepose.capture.session import Session, load_session
 from tubepose.config import Config
 from tubepose.detection.geometric import GeometricDetector
@@ -51,7 +51,8 @@ def results(session: Session, truth: pd.DataFrame) -> tuple[pd.DataFrame, pd.Dat
 
 
 def test_the_manifest_describes_it() -> None:
-    assert verify_manifest(read_manifest(ROOT / "data_manifest.yaml"), ROOT) == []
+    entries = {entry.name: entry for entry in read_manifest(ROOT / "data_manifest.yaml").data_sets}
+    assert check_data_set(entries["sample"], ROOT).differences == ()
 
 
 def test_it_is_called_simulated_and_is_small(session: Session) -> None:

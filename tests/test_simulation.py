@@ -9,8 +9,8 @@ from tubepose.labware import load_cap, load_rack, load_tube
 from tubepose.simulation import meshes, raycast
 from tubepose.simulation.camera import NO_NOISE, NoiseModel, default_camera
 from tubepose.simulation.placement import place_rack, place_tubes
+from tubepose.simulation.random_scene import random_scene
 from tubepose.simulation.scene import OPAQUE_BODY, Material, Plastic, Scene
-from tubepose.simulation.sessions import make_scene
 
 RACK = load_rack("chen2023-soft-5x10")
 CAP = load_cap("printed-square-16.7")
@@ -22,7 +22,7 @@ def camera(resolution=240, noise=NO_NOISE):
 
 
 def scene_of(name, seed=1, resolution=240, materials=None):
-    scene = make_scene(RACK, [load_tube(name)], CAP, camera(resolution), np.random.default_rng(seed))
+    scene = random_scene(RACK, [load_tube(name)], CAP, camera(resolution), np.random.default_rng(seed))
     return dataclasses.replace(scene, materials=materials)
 
 

@@ -10,7 +10,7 @@ from tubepose.errors import LabwareError
 from tubepose.labware import load_cap, load_rack, load_tube
 from tubepose.simulation.collision import polygons_overlap
 from tubepose.simulation.placement import lean, place_tubes
-from tubepose.simulation.scene import MATERIALS, PlacedTube, tube_parts
+from tubepose.simulation.scene import MATERIALS, Finishes, PlacedTube, tube_parts
 from tubepose.transforms import invert_transform, tilt_rad, transform_points
 
 RACK = load_rack("chen2023-soft-5x10")
@@ -21,7 +21,9 @@ UP = np.array([0.0, 0.0, 1.0])
 
 def vertices(tube, cap):
     """Vertices of a tube's parts in the rack frame."""
-    return [transform_points(tube.T_rack_tube, mesh.vertices_m) for mesh, _ in tube_parts(tube, cap, MATERIALS)]
+    return [
+        transform_points(tube.T_rack_tube, mesh.vertices_m) for mesh, _ in tube_parts(tube, cap, MATERIALS, Finishes())
+    ]
 
 
 @pytest.mark.parametrize(
@@ -39,7 +41,9 @@ def test_tubes_stay_within_their_slots_and_stand_on_the_floor(rack_name, name):
     tilts = []
     for _ in range(60):
         T = lean(rack, slot, model, rng)
-        body = transform_points(T, next(iter(tube_parts(_placed(slot, model, T), None, MATERIALS)))[0].vertices_m)
+        body = transform_points(
+            T, next(iter(tube_parts(_placed(slot, model, T), None, MATERIALS, Finishes())))[0].vertices_m
+        )
         inside = body[body[:, 2] <= rack.height_m]
         assert slot.signed_distance_m(inside[:, :2]).max() <= 1e-6
         assert body[:, 2].min() == pytest.approx(rack.floor_m, abs=3e-5)

@@ -10,8 +10,7 @@ from tubepose.capture.session import load_session
 from tubepose.capture.source import open_captures
 from tubepose.errors import CaptureError, ConfigError
 from tubepose.labware import load_cap, load_rack, load_tube
-from tubepose.simulation import read_exact_truth, simulate_session
-from tubepose.simulation.sessions import SENSORS
+from tubepose.simulation import SENSORS, SceneVariation, read_exact_truth, simulate_session
 
 RACK = load_rack("chen2023-soft-5x10")
 CAP = load_cap("printed-square-16.7")
@@ -34,18 +33,23 @@ def seen_scenes(monkeypatch):
     """Replace the sensor by one that notes the scenes and sees nothing."""
     scenes = []
 
-    def blind(scene, camera, rng):
+    def blind(scene, camera, rng, *, threads=1):
         scenes.append(scene)
         k = camera.intrinsics
         return RgbdFrame(np.full((k.height, k.width, 3), np.nan), np.zeros((k.height, k.width), np.uint8), k, None, "")
 
-    monkeypatch.setitem(SENSORS, "raycast", blind)
+    for name in ("raycast", "structured-light"):
+        monkeypatch.setitem(SENSORS, name, blind)
     return scenes
 
 
-def test_the_same_seed_gives_the_same_bytes(tmp_path):
+def filled(low, high):
+    return {"variation": SceneVariation(fill=(low, high))}
+
+
+def test_the_same_seed_gives_the_same_bytes_with_one_and_two_threads(tmp_path):
     first = digests(simulate(tmp_path / "a" / "s"))
-    assert digests(simulate(tmp_path / "b" / "s")) == first
+    assert digests(simulate(tmp_path / "b" / "s", threads=2)) == first
     other = digests(simulate(tmp_path / "c" / "s", seed=8))
     assert other.keys() == first.keys()
     images = [name for name in first if name.endswith(("depth.png", "image.png"))]
@@ -108,11 +112,11 @@ def test_the_hint_points_at_the_first_slot(tmp_path, seen_scenes):
 
 
 def test_fill_and_mixed(tmp_path, seen_scenes):
-    session = load_session(simulate(tmp_path / "s", mixed=True, trials=4, fill=0.3))
+    session = load_session(simulate(tmp_path / "s", mixed=True, trials=4, **filled(0.3, 0.3)))
     assert [trial.name for trial in session.trials] == [f"mixed-{k:03d}" for k in (1, 2, 3, 4)]
     assert all(len(trial.tubes) == 15 for trial in session.trials)
     assert set(session.trials[0].tubes.values()) == {"chen2023-tube-1", "chen2023-tube-2"}
-    sparse = load_session(simulate(tmp_path / "one", fill=0.001))
+    sparse = load_session(simulate(tmp_path / "one", **filled(0.001, 0.001)))
     assert all(len(trial.tubes) == 1 for trial in sparse.trials)
 
 
@@ -158,22 +162,87 @@ def test_an_empty_folder_is_filled_and_a_full_one_refused(tmp_path, seen_scenes)
     assert digests(tmp_path) == before
 
 
-def test_a_failure_leaves_nothing_behind(tmp_path, monkeypatch):
-    def broken(scene, camera, rng):
-        raise RuntimeError("broken")
+def broken_after(captures, scenes):
+    """A sensor that fails after some captures."""
+    whole = SENSORS["raycast"]
 
-    monkeypatch.setitem(SENSORS, "raycast", broken)
-    with pytest.raises(RuntimeError, match="broken"):
+    def sensor(scene, camera, rng, *, threads=1):
+        if len(scenes) == captures:
+            raise KeyboardInterrupt
+        return whole(scene, camera, rng)
+
+    return sensor
+
+
+def test_a_failure_leaves_nothing_behind(tmp_path, monkeypatch, seen_scenes):
+    monkeypatch.setitem(SENSORS, "raycast", broken_after(3, seen_scenes))
+    with pytest.raises(KeyboardInterrupt):
         simulate(tmp_path / "s")
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("capture_format", ["folder", "mcap"])
+def test_a_stopped_session_goes_on_where_it_was(tmp_path, monkeypatch, seen_scenes, capture_format):
+    options = {"resume": True, "capture_format": capture_format, "resolution": 32}
+    whole = digests(simulate(tmp_path / "whole", **options))
+    seen_scenes.clear()
+    with monkeypatch.context() as patch:
+        patch.setitem(SENSORS, "raycast", broken_after(3, seen_scenes))
+        with pytest.raises(KeyboardInterrupt):
+            simulate(tmp_path / "s", **options)
+    assert not (tmp_path / "s").exists()
+    with pytest.raises(CaptureError, match=r"\.s\.part: captures of an interrupted run with other options"):
+        simulate(tmp_path / "s", **options | {"seed": 8})
+    calls = []
+    simulate(tmp_path / "s", **options, progress=lambda *counts: calls.append(counts))
+    assert calls == [(1, 1)]
+    assert digests(tmp_path / "s") == whole
+    assert {path.name for path in tmp_path.iterdir()} == {"whole", "s"}
+
+
+def test_no_scene_depends_on_the_sensor(tmp_path, seen_scenes):
+    varied = SceneVariation(liquid_share=0.5, label_share=0.5, scattering_per_mm=(0.0, 1.0))
+    options = {"variation": varied, "trials": 2, "resolution": 64}
+    one = simulate(tmp_path / "one", **options)
+    other = simulate(tmp_path / "other", **options, sensor="structured-light")
+    truths = [{k: v for k, v in digests(out).items() if k.startswith("simulation_truth/")} for out in (one, other)]
+    assert len(truths[0]) == 4
+    assert truths[0] == truths[1]
+    first, second = load_session(one), load_session(other)
+    assert (first.trials, first.sensor) == (second.trials, "simulated-raycast")
+    assert (second.sensor, first.name != second.name) == ("simulated-structured-light", True)
+
+
+def test_sessions_of_other_materials_have_other_names(tmp_path, seen_scenes):
+    dark, light = (
+        load_session(simulate(tmp_path / str(share), variation=SceneVariation(table_albedo=(share, share))))
+        for share in (0.1, 0.5)
+    )
+    assert dark.trials == light.trials
+    assert dark.name != light.name
+
+
+def test_a_camera_without_calibration_error(tmp_path, monkeypatch):
+    cameras = []
+
+    def noting(scene, camera, rng, *, threads=1):
+        cameras.append(camera)
+        raise KeyboardInterrupt
+
+    monkeypatch.setitem(SENSORS, "raycast", noting)
+    for wanted in (True, False):
+        with pytest.raises(KeyboardInterrupt):
+            simulate(tmp_path / "s", calibration_error=wanted)
+    assert cameras[0].noise.calibration_error_m > 0
+    assert cameras[1].noise.calibration_error_m == 0
 
 
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"sensor": "laser"}, "unknown sensor 'laser'; known sensors: raycast"),
+        ({"sensor": "laser"}, "unknown sensor 'laser'; known sensors: raycast, structured-light"),
         ({"trials": 0}, "trials is 0; expected 1 or more"),
-        ({"fill": 1.5}, "fill is 1.5"),
+        ({"threads": 0}, "threads is 0; expected 1 or more"),
         ({"tubes": []}, "tubes: found none"),
         ({"tubes": [TUBES[0], TUBES[0]]}, "found chen2023-tube-1 twice"),
         ({"capture_format": "bag"}, "known formats: folder, mcap"),

@@ -1,20 +1,40 @@
-"""The manifest of data sets: where each is from, its size and digest, sensor, licence and split."""
+"""The manifest of data sets: where each is from, the size and digest of every file, sensor, licence and split."""
 
 from __future__ import annotations
 
 import hashlib
+import os
+from collections.abc import Iterable
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import yaml
-from pydantic import BaseModel, ConfigDict, Field, StrictBool, StrictInt
+from pydantic import BaseModel, ConfigDict, Field, StrictBool, StrictInt, model_validator
 
 from tubepose.errors import CaptureError
 from tubepose.labware.reading import read_yaml, validate
 
-Split = Literal["sample", "train", "validation", "test"]
+Split = Literal["dev", "test"]
+State = Literal["ok", "differs", "absent"]
 _STRICT = ConfigDict(extra="forbid", frozen=True)
+_SHA256 = Field(pattern=r"^[0-9a-f]{64}$")
 _BLOCK = 1 << 20
+
+
+class DataFile(BaseModel):
+    """One file of a data set.
+
+    Attributes:
+        path: Relative to the data set's folder; the file's own name if the data set is one file.
+        bytes: Its size.
+        sha256: Its digest.
+    """
+
+    model_config = _STRICT
+    path: str = Field(min_length=1)
+    bytes: StrictInt = Field(ge=0)
+    sha256: str = _SHA256
 
 
 class DataSet(BaseModel):
@@ -25,12 +45,12 @@ class DataSet(BaseModel):
         path: File or folder, relative to the manifest's own folder.
         source: Where it is from: an address, or the command that made it.
         bytes: Size of all its files.
-        files: How many files it has.
         sha256: Digest of the file; of a folder that of its listing (see `tree_sha256`).
         sensor: What recorded it.
         licence: SPDX name, or how it may be used.
-        split: What it may be used for; parameters are never fitted to ``test``.
+        split: What it may be used for: ``dev`` to build and choose with, ``test`` to report only.
         simulated: True if no sensor recorded it.
+        files: Every file, sorted by path.
     """
 
     model_config = _STRICT
@@ -38,20 +58,44 @@ class DataSet(BaseModel):
     path: str = Field(min_length=1)
     source: str = Field(min_length=1)
     bytes: StrictInt = Field(ge=0)
-    files: StrictInt = Field(ge=0)
-    sha256: str = Field(pattern=r"^[0-9a-f]{64}$")
+    sha256: str = _SHA256
     sensor: str = Field(min_length=1)
     licence: str = Field(min_length=1)
     split: Split
     simulated: StrictBool
+    files: tuple[DataFile, ...]
+
+    @model_validator(mode="after")
+    def _check(self) -> DataSet:
+        if self.bytes != sum(file.bytes for file in self.files):
+            raise ValueError(f"{self.name}: bytes is {self.bytes}; expected the sum of its files")
+        alone = len(self.files) == 1 and self.sha256 == self.files[0].sha256
+        if not alone and self.sha256 != _listing_sha256((file.sha256, file.path) for file in self.files):
+            raise ValueError(f"{self.name}: sha256 is not that of the listing of its files")
+        return self
 
 
 class Manifest(BaseModel):
     """All data sets that the project knows."""
 
     model_config = _STRICT
-    format: Literal[1] = 1
+    format: Literal[2] = 2
     data_sets: tuple[DataSet, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Check:
+    """A data set compared with its files.
+
+    Attributes:
+        data_set: Its entry in the manifest.
+        state: ``ok``, ``differs``, or ``absent`` where nothing of it is there.
+        differences: One line per file that differs, is missing or is not in the manifest.
+    """
+
+    data_set: DataSet
+    state: State
+    differences: tuple[str, ...] = ()
 
 
 def read_manifest(path: Path) -> Manifest:
@@ -68,31 +112,57 @@ def read_manifest(path: Path) -> Manifest:
     return manifest
 
 
+class _Line(dict[str, Any]):
+    """A mapping that is written on one line."""
+
+
+class _Dumper(yaml.SafeDumper):
+    """YAML with a line per file."""
+
+
+_Dumper.add_representer(
+    _Line, lambda dumper, line: dumper.represent_mapping("tag:yaml.org,2002:map", line, flow_style=True)
+)
+
+
 def write_manifest(path: Path, manifest: Manifest) -> None:
-    """Write a manifest: aside first, then renamed."""
-    text = yaml.safe_dump(manifest.model_dump(mode="json"), sort_keys=False, width=120, allow_unicode=True)
+    """Write a manifest, one line per file: aside first, then renamed."""
+    data = manifest.model_dump(mode="json")
+    for entry in data["data_sets"]:
+        entry["files"] = [_Line(file) for file in entry["files"]]
+    text = yaml.dump(data, Dumper=_Dumper, sort_keys=False, width=10_000, allow_unicode=True)
     aside = path.with_name(f".{path.name}.part")
     aside.write_text(text, encoding="utf-8")
     aside.replace(path)
 
 
-def verify_manifest(manifest: Manifest, root: Path) -> list[str]:
-    """Compare every data set with what lies under `root`; one line per difference, none if all is well."""
-    problems = []
-    for entry in manifest.data_sets:
-        place = root / entry.path
-        if not place.exists():
-            problems.append(f"{entry.name}: {entry.path} is not there; it is from {entry.source}")
-            continue
-        size, count, digest = measure(place)
-        if (size, count) != (entry.bytes, entry.files):
-            problems.append(
-                f"{entry.name}: {entry.path} has {size} bytes in {count} file(s), the manifest says {entry.bytes} in "
-                f"{entry.files}"
-            )
-        elif digest != entry.sha256:
-            problems.append(f"{entry.name}: {entry.path} has the sha256 {digest}, the manifest says {entry.sha256}")
-    return problems
+def with_entry(manifest: Manifest, entry: DataSet) -> Manifest:
+    """The manifest with an entry in the place of the one of the same name, or at its end."""
+    if entry.name in {known.name for known in manifest.data_sets}:
+        kept = tuple(entry if known.name == entry.name else known for known in manifest.data_sets)
+        return manifest.model_copy(update={"data_sets": kept})
+    return manifest.model_copy(update={"data_sets": (*manifest.data_sets, entry)})
+
+
+def check_data_set(entry: DataSet, root: Path) -> Check:
+    """Compare a data set with what lies under `root`, file by file."""
+    place = root / entry.path
+    found = {file.path: file for file in _measured(place)} if place.exists() else {}
+    if not found:
+        return Check(entry, "absent")
+    known = {file.path: file for file in entry.files}
+    lines = []
+    for path in sorted(found.keys() | known.keys()):
+        where = f"{entry.name}: {entry.path if place.is_file() else f'{entry.path}/{path}'}"
+        if path not in found:
+            lines.append(f"{where}: missing; expected {known[path].bytes} bytes")
+        elif path not in known:
+            lines.append(f"{where}: not in the manifest")
+        elif found[path].bytes != known[path].bytes:
+            lines.append(f"{where}: {found[path].bytes} bytes; expected {known[path].bytes}")
+        elif found[path].sha256 != known[path].sha256:
+            lines.append(f"{where}: sha256 {found[path].sha256}; expected {known[path].sha256}")
+    return Check(entry, "differs" if lines else "ok", tuple(lines))
 
 
 def manifest_entry_for(
@@ -103,28 +173,23 @@ def manifest_entry_for(
     Raises:
         CaptureError: It is not there, or not under `root`.
     """
-    if not place.exists() or not place.resolve().is_relative_to(root.resolve()):
+    # Not resolved: a folder of data may be a link to another disk.
+    where, base = Path(os.path.abspath(place)), Path(os.path.abspath(root))
+    if not place.exists() or not where.is_relative_to(base):
         raise CaptureError(f"{place}: expected an existing file or folder under {root}")
-    size, count, digest = measure(place)
+    files = _measured(place)
     return DataSet(
         name=name,
-        path=place.resolve().relative_to(root.resolve()).as_posix(),
+        path=where.relative_to(base).as_posix(),
         source=source,
-        bytes=size,
-        files=count,
-        sha256=digest,
+        bytes=sum(file.bytes for file in files),
+        sha256=files[0].sha256 if place.is_file() else _listing_sha256((file.sha256, file.path) for file in files),
         sensor=sensor,
         licence=licence,
         split=split,
         simulated=simulated,
+        files=files,
     )
-
-
-def measure(place: Path) -> tuple[int, int, str]:
-    """Bytes, number of files, and sha256 of a file or folder."""
-    files = _files(place)
-    digest = file_sha256(place) if place.is_file() else tree_sha256(place)
-    return sum(file.stat().st_size for file in files), len(files), digest
 
 
 def file_sha256(path: Path) -> str:
@@ -141,15 +206,25 @@ def tree_sha256(folder: Path) -> str:
 
     Files and folders whose names start with a dot, and `__pycache__`, do not count.
     """
-    lines = [f"{file_sha256(file)}  {file.relative_to(folder).as_posix()}\n" for file in _files(folder)]
-    return hashlib.sha256("".join(lines).encode("utf-8")).hexdigest()
+    return _listing_sha256((file_sha256(file), path) for path, file in _files(folder))
 
 
-def _files(place: Path) -> list[Path]:
+def _listing_sha256(files: Iterable[tuple[str, str]]) -> str:
+    return hashlib.sha256("".join(f"{digest}  {path}\n" for digest, path in files).encode("utf-8")).hexdigest()
+
+
+def _measured(place: Path) -> tuple[DataFile, ...]:
+    return tuple(
+        DataFile(path=path, bytes=file.stat().st_size, sha256=file_sha256(file)) for path, file in _files(place)
+    )
+
+
+def _files(place: Path) -> list[tuple[str, Path]]:
+    """Files with their paths in the data set, sorted by those."""
     if place.is_file():
-        return [place]
+        return [(place.name, place)]
     found = [file for file in place.rglob("*") if file.is_file() and _counts(file.relative_to(place))]
-    return sorted(found, key=lambda file: file.relative_to(place).as_posix())
+    return sorted((file.relative_to(place).as_posix(), file) for file in found)
 
 
 def _counts(relative: Path) -> bool:

@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 from tubepose.capture.description import Unit
 from tubepose.capture.frame import CameraIntrinsics, RgbdFrame
 from tubepose.capture.recording import Recording, StampedMessage, index_recording, read_messages
-from tubepose.capture.registration import METRES_PER_UNIT, clean_cloud, depth_to_metres, project_cloud
-from tubepose.capture.ros import DEPTH_ENCODINGS, POINT_CLOUD, camera_of, cloud_arrays, image_array, picture
+from tubepose.capture.registration import METRES_PER_UNIT, clean_cloud, project_cloud
+from tubepose.capture.ros import POINT_CLOUD, camera_of, cloud_arrays, depth_image, picture
 from tubepose.capture.topics import Chosen, Topic, TopicChoice, choose_topics
 from tubepose.errors import CaptureError
 from tubepose.transforms import FloatArray
@@ -102,8 +102,8 @@ class McapCapture:
                 f"{where}: a depth image needs the CameraInfo of a rectified camera, found {found}; record it with the "
                 "depth, or name it with --info-topic"
             )
-        _check_info(where, "depth image", (fields.height, fields.width), camera)
-        depth = depth_to_metres(image_array(fields, where), DEPTH_ENCODINGS[fields.encoding])
+        depth = depth_image(fields, chosen.source.schema, where)
+        _check_info(where, "depth image", depth.shape, camera)
         return camera.backproject(depth), None
 
 
@@ -141,11 +141,7 @@ def _organised_by(cloud: FloatArray, camera: CameraIntrinsics | None) -> bool:
 
 
 def _camera(info: Topic | None, topic: Topic) -> CameraIntrinsics | None:
-    return (
-        camera_of(info.first, rectified="rect" in topic.name.removesuffix("/compressed").split("/")[-1])
-        if info is not None
-        else None
-    )
+    return camera_of(info.first, rectified="rect" in topic.base_name.split("/")[-1]) if info is not None else None
 
 
 def _check_info(where: str, what: str, shape: tuple[int, ...], camera: CameraIntrinsics) -> None:

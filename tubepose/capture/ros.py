@@ -8,8 +8,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from tubepose.capture.compressed_depth import decode_compressed_depth, is_compressed_depth
 from tubepose.capture.frame import CameraIntrinsics
 from tubepose.capture.images import decode, to_picture
+from tubepose.capture.registration import depth_to_metres
 from tubepose.errors import CaptureError
 from tubepose.transforms import FloatArray
 
@@ -104,10 +106,21 @@ def image_array(message: Any, where: str) -> NDArray[np.generic]:
 def picture(message: Any, schema: str, where: str) -> NDArray[np.uint8]:
     """An Image or CompressedImage as uint8 picture, gray or RGB."""
     if schema == COMPRESSED_IMAGE:
-        if "compresseddepth" in message.format.lower():
+        if is_compressed_depth(message.format):
             raise CaptureError(f"{where}: a compressed depth image is no picture; choose another --image-topic")
         return to_picture(decode(bytes(message.data), where), bgr=True)
     return to_picture(image_array(message, where), bgr=message.encoding.startswith("bgr") or message.encoding == "8UC3")
+
+
+def depth_image(message: Any, schema: str, where: str) -> FloatArray:
+    """Depth (H, W) in metres of an Image or CompressedImage that holds depth; NaN for invalid pixels.
+
+    Raises:
+        CaptureError: Fewer bytes than the layout needs, or compressed depth that is cut or of a kind that is not read.
+    """
+    if schema == COMPRESSED_IMAGE:
+        return decode_compressed_depth(message.format, bytes(message.data), where)
+    return depth_to_metres(image_array(message, where), DEPTH_ENCODINGS[message.encoding])
 
 
 def camera_of(info: Any, *, rectified: bool) -> CameraIntrinsics | None:

@@ -6,9 +6,12 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from typing import Any
 
+from tubepose.capture.compressed_depth import is_compressed_depth
 from tubepose.capture.ros import CAMERA_INFO, COMPRESSED_IMAGE, DEPTH_ENCODINGS, IMAGE, POINT_CLOUD
 from tubepose.errors import CaptureError
 
+# What image_transport adds to a topic's name for its compressed twin.
+_TWINS = ("/compressedDepth", "/compressed")
 # Words in the names of pictures that no detector is made for, and of those that it is.
 _NO_PICTURE = ("depth", "snr", "infra", "confidence", "normal", "disparity", "mask")
 _PICTURE = ("color", "colour", "rgb", "texture")
@@ -21,7 +24,7 @@ class TopicChoice:
     Attributes:
         cloud: Of PointCloud2 messages.
         image: Of Image or CompressedImage messages.
-        depth: Of Image messages that hold depth.
+        depth: Of Image or CompressedImage messages that hold depth.
         info: Of CameraInfo messages.
     """
 
@@ -49,15 +52,23 @@ class Topic:
 
     @property
     def is_depth(self) -> bool:
-        """True for an image that holds depth: 32FC1, or 16UC1 (which a 16-bit gray picture calls mono16)."""
+        """True for an image that holds depth: compressedDepth, 32FC1, or 16UC1 (a 16-bit gray picture is mono16)."""
+        if self.schema == COMPRESSED_IMAGE:
+            return is_compressed_depth(self.first.format)
         return self.schema == IMAGE and self.first.encoding in DEPTH_ENCODINGS
 
     @property
     def is_picture(self) -> bool:
         """True for any other image."""
-        if self.schema == COMPRESSED_IMAGE:
-            return "compresseddepth" not in self.first.format.lower()
-        return self.schema == IMAGE and not self.is_depth
+        return self.schema in (IMAGE, COMPRESSED_IMAGE) and not self.is_depth
+
+    @property
+    def base_name(self) -> str:
+        """The name without what image_transport adds for a compressed image."""
+        for twin in _TWINS:
+            if self.schema == COMPRESSED_IMAGE and self.name.endswith(twin):
+                return self.name.removesuffix(twin)
+        return self.name
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,6 +97,10 @@ def choose_topics(topics: Iterable[Topic], asked: TopicChoice, where: str) -> Ch
     found = {topic.name: topic for topic in topics}
     source = _source(found, asked, where)
     image = _pick(found, asked.image, lambda t: t.is_picture, "image", where, _best_pictures)
+    if image is source:
+        raise CaptureError(
+            f"{where}: --image-topic {image.name} is the depth that the frames are made of; name a picture instead"
+        )
     info = _pick(found, asked.info, lambda t: t.schema == CAMERA_INFO, "info", where) if asked.info else None
     return Chosen(source, image, info or _info_of(source, found), (info or _info_of(image, found)) if image else None)
 
@@ -102,7 +117,9 @@ def _source(found: dict[str, Topic], asked: TopicChoice, where: str) -> Topic:
         source = _pick(found, asked.depth, lambda t: t.is_depth, "depth", where, _best_depths)
     if source is None:
         there = ", ".join(f"{t.name} ({t.schema})" for t in found.values()) or "no message of a type that is read"
-        raise CaptureError(f"{where}: expected a PointCloud2, or an Image of 16UC1 or 32FC1 depth, found {there}")
+        raise CaptureError(
+            f"{where}: expected a PointCloud2, or 16UC1 or 32FC1 depth as Image or compressedDepth, found {there}"
+        )
     return source
 
 
@@ -132,15 +149,20 @@ def _pick(
 def _best_pictures(candidates: list[Topic]) -> list[Topic]:
     pictures = [topic for topic in candidates if not _named(topic, _NO_PICTURE)]
     named = [topic for topic in pictures if _named(topic, _PICTURE)] or pictures
-    # A picture recorded both raw and compressed is one picture.
-    twins = {f"{topic.name}/compressed" for topic in named}
-    return [topic for topic in named if topic.name not in twins]
+    return _without_twins(named)
 
 
 def _best_depths(candidates: list[Topic]) -> list[Topic]:
-    return [topic for topic in candidates if _named(topic, ("aligned",))] or [
-        topic for topic in candidates if not _named(topic, ("snr", "confidence"))
-    ]
+    return _without_twins(
+        [topic for topic in candidates if _named(topic, ("aligned",))]
+        or [topic for topic in candidates if not _named(topic, ("snr", "confidence"))]
+    )
+
+
+def _without_twins(candidates: list[Topic]) -> list[Topic]:
+    """An image recorded both raw and compressed is one image: the raw one."""
+    raw = {topic.name for topic in candidates if topic.name == topic.base_name}
+    return [topic for topic in candidates if topic.name == topic.base_name or topic.base_name not in raw]
 
 
 def _named(topic: Topic, words: tuple[str, ...]) -> bool:
@@ -150,7 +172,7 @@ def _named(topic: Topic, words: tuple[str, ...]) -> bool:
 def _info_of(topic: Topic, found: dict[str, Topic]) -> Topic | None:
     """The CameraInfo beside a topic, by ROS's rule of names; else the only one there is."""
     infos = [other for other in found.values() if other.schema == CAMERA_INFO]
-    base = topic.name.removesuffix("/compressed").rsplit("/", 1)[0]
+    base = topic.base_name.rsplit("/", 1)[0]
     beside = [info for info in infos if info.name == f"{base}/camera_info"]
     if beside:
         return beside[0]

@@ -1,8 +1,9 @@
-"""The structured-light camera: geometry, noise, phase decoding, triangulation. Shared by every simulated sensor.
+"""The structured-light camera: optics, exposure, phase decoding, triangulation. Shared by every simulated sensor.
 
 Light transport is linear, so a sensor only has to deliver, per pixel, the sums over all light paths of
 ``a * [1, cos(2 pi u / p), sin(2 pi u / p)]`` with the amplitude ``a`` and projector column ``u`` of each path, for
-three periods ``p``. Any phase-shift image sequence follows from these sums; what is decoded from them is the scan.
+three periods ``p``. Every image of a phase-shift sequence follows from these sums. The camera takes the images one by
+one, with their noise, and what it decodes from them is the scan.
 """
 
 from __future__ import annotations
@@ -23,6 +24,11 @@ FULL_RESOLUTION = 1376
 FULL_FOCAL_PX = 1564.0
 MIN_BLUR_PX = 0.4
 IMAGE_GAIN = 0.75
+BLACK_LEVEL = 0.01
+"""The converter reaches below zero by this share of saturation, so that noise in the dark keeps its mean."""
+CALIBRATION_TERMS = {(2, 0): 1.0, (1, 1): -0.8, (0, 2): 0.7, (3, 0): 0.6, (1, 2): -0.5, (0, 3): 0.4}
+"""Weights of products of Legendre polynomials in u and v. No term of degree 0 or 1: those move and tilt the whole
+cloud, as another frame of reference would."""
 CHANNELS = 2 + 2 * len(PERIODS)
 """Rows of a sum image: projected light, room light, then cosine and sine of each period."""
 
@@ -31,28 +37,55 @@ CHANNELS = 2 + 2 * len(PERIODS)
 class NoiseModel:
     """Imperfections of the camera. All numbers are assumptions; docs/simulation.md says what they were compared with.
 
+    The unit of light is the return of a white surface that faces the projector at the working distance.
+
     Attributes:
         blur_px: Standard deviation of the lens blur at 1376 pixels; it mixes the two sides of an edge.
-        read: Standard deviation of the noise of a dark pixel, in units of a white surface's return.
-        shot: Variance of the noise per unit of light.
-        room_light: Room light on a white surface, in the same unit.
-        smooth_depth_m: Standard deviation of the depth error that neighbouring pixels share.
+        steps: Images per period, 3 or more.
+        exposure: Unit light as a share of saturation; 1 / `exposure` is the light that saturates.
+        full_well_e: Electrons at saturation. Shot noise is the square root of the electrons.
+        read_noise_e: Standard deviation of the noise of a dark pixel, electrons.
+        bits: Of the converter; 0 turns quantisation off.
+        room_light: Room light on a white surface.
+        smooth_depth_m: Standard deviation of the depth error that neighbouring pixels share, new in each capture.
         smooth_length_m: Distance at which that error's correlation has fallen to 1/e, at the working distance.
+        calibration_error_m: RMS over the image of a smooth distortion of depth that is the same in all captures.
         min_modulation: A weaker pattern is not decoded.
         max_phase_jump: Largest disagreement of neighbouring periods, as a share of the finer period.
     """
 
     blur_px: float = 1.0
-    read: float = 0.003
-    shot: float = 0.8e-4
+    steps: int = 4
+    exposure: float = 0.5
+    full_well_e: float = 27_000.0
+    read_noise_e: float = 27.0
+    bits: int = 10
     room_light: float = 0.15
     smooth_depth_m: float = 2.0e-5
     smooth_length_m: float = 3.0e-3
+    calibration_error_m: float = 5.0e-5
     min_modulation: float = 0.03
     max_phase_jump: float = 0.35
 
+    @property
+    def quantum(self) -> float:
+        """Light of one count of the converter; 0 without quantisation."""
+        return (1 + BLACK_LEVEL) / (self.exposure * (2**self.bits - 1)) if self.bits else 0.0
 
-NO_NOISE = NoiseModel(blur_px=0.0, read=0.0, shot=0.0, smooth_depth_m=0.0)
+    @property
+    def electron(self) -> float:
+        """Light that gives one electron: the variance of shot noise per unit of light."""
+        return 1 / (self.exposure * self.full_well_e)
+
+    @property
+    def read(self) -> float:
+        """Standard deviation of a dark pixel's noise, in units of light."""
+        return self.read_noise_e * self.electron
+
+
+NO_NOISE = NoiseModel(
+    blur_px=0.0, full_well_e=np.inf, read_noise_e=0.0, bits=0, smooth_depth_m=0.0, calibration_error_m=0.0
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -110,29 +143,67 @@ class StructuredLightCamera:
         with np.errstate(divide="ignore", invalid="ignore"):
             return np.asarray((x[0] - tangent * z[0]) * self.baseline_m / across)
 
-    def expose(self, sums: Float32Array, rng: np.random.Generator) -> Float32Array:
-        """What the camera records of ideal sums of shape (CHANNELS, H, W): blurred, then with shot and read noise."""
-        noise = self.noise
-        seen = sums.copy()
-        if noise.blur_px > 0:
-            # A coarser image is the same camera with larger pixels.
-            sigma_px = max(noise.blur_px * self.intrinsics.width / FULL_RESOLUTION, MIN_BLUR_PX)
-            seen = np.stack([cv2.GaussianBlur(channel, (0, 0), sigma_px) for channel in sums])
-        level = seen[0] + np.float32(noise.room_light) * seen[1]
-        sigma = np.sqrt(np.float32(noise.read**2) + np.float32(noise.shot) * level)
-        for channel in seen[2:]:
-            channel += sigma * rng.standard_normal(sigma.shape, dtype=np.float32)
-        return seen
+    def blurred(self, sums: Float32Array) -> Float32Array:
+        """Ideal sums of shape (CHANNELS, H, W) behind the lens. Blurring them is blurring every image made of them."""
+        if self.noise.blur_px == 0:
+            return sums
+        # A coarser image is the same camera with larger pixels.
+        sigma_px = max(self.noise.blur_px * self.intrinsics.width / FULL_RESOLUTION, MIN_BLUR_PX)
+        return np.stack([cv2.GaussianBlur(channel, (0, 0), sigma_px) for channel in sums])
 
-    def decode(self, seen: Float32Array) -> Float32Array:
-        """Projector column (H, W) of recorded sums; NaN where the pattern is too weak or its periods disagree."""
+    def expose(self, light: Float32Array, rng: np.random.Generator) -> Float32Array:
+        """One image (H, W) as recorded, in units of light: noise, quantisation; at most the light that saturates."""
         noise = self.noise
-        column = np.zeros(seen.shape[1:], dtype=np.float32)
+        # Shot noise is taken as normal: the faintest pattern that is decoded still gives hundreds of electrons.
+        image = np.maximum(light, np.float32(0))
+        image *= np.float32(noise.electron)
+        image += np.float32(noise.read**2)
+        np.sqrt(image, out=image)
+        image *= rng.standard_normal(light.shape, dtype=np.float32)
+        image += light
+        if noise.bits:
+            image /= np.float32(noise.quantum)
+            np.rint(image, out=image)
+            image *= np.float32(noise.quantum)
+        low, high = np.float32(-BLACK_LEVEL / noise.exposure), np.float32(1 / noise.exposure)
+        return np.clip(image, low, high, out=image)
+
+    def phasors(self, seen: Float32Array, rng: np.random.Generator) -> Float32Array:
+        """Cosine and sine of every period, shape (2 * len(PERIODS), H, W), from recorded images of blurred sums.
+
+        Image k of a period shows the pattern ``(1 + cos(2 pi u / p - 2 pi k / steps)) / 2`` and the room's light.
+        A pixel that saturates in any image is NaN.
+        """
+        steps = self.noise.steps
+        full = np.float32(1 / self.noise.exposure)
+        mean = seen[0] / 2
+        mean += np.float32(self.noise.room_light) * seen[1]
+        found = np.zeros((2 * len(PERIODS), *mean.shape), dtype=np.float32)
+        saturated = np.zeros(mean.shape, dtype=bool)
+        for period in range(len(PERIODS)):
+            cosine, sine = seen[2 + 2 * period], seen[3 + 2 * period]
+            for angle in 2 * np.pi * np.arange(steps) / steps:
+                # Rounded: of four steps half the weights are zero, and should be exactly that.
+                c, s = np.float32(np.round(np.cos(angle), 12)), np.float32(np.round(np.sin(angle), 12))
+                image = self.expose(mean + (c / 2) * cosine + (s / 2) * sine, rng)
+                saturated |= image >= full
+                found[2 * period] += (4 / steps * c) * image
+                found[2 * period + 1] += (4 / steps * s) * image
+        found[:, saturated] = np.nan
+        return found
+
+    def decode(self, phasors: Float32Array) -> Float32Array:
+        """Projector column (H, W) of phasors (2 * len(PERIODS), H, W).
+
+        NaN where the pattern is too weak, where neighbouring periods disagree, and where a phasor is NaN.
+        """
+        noise = self.noise
+        column = np.zeros(phasors.shape[1:], dtype=np.float32)
         valid = np.ones(column.shape, dtype=bool)
         for i, period in enumerate(PERIODS):
-            cosine, sine = seen[2 + 2 * i], seen[3 + 2 * i]
+            cosine, sine = phasors[2 * i], phasors[2 * i + 1]
             wrapped = np.arctan2(sine, cosine) * np.float32(period / (2 * np.pi))
-            valid &= np.hypot(sine, cosine) > noise.min_modulation
+            valid &= cosine**2 + sine**2 > noise.min_modulation**2
             if i == 0:
                 column = np.where(wrapped < 0, wrapped + np.float32(period), wrapped)
                 continue
@@ -153,22 +224,30 @@ class StructuredLightCamera:
         smooth = cv2.GaussianBlur(white, (0, 0), max(sigma_px, 0.3))
         return np.asarray(smooth * np.float32(self.noise.smooth_depth_m / smooth.std()), dtype=np.float32)
 
+    def calibration_error_m(self) -> Float32Array:
+        """Distortion of depth (H, W) by an imperfect calibration, metres: a polynomial of degree 3 over the image."""
+        k = self.intrinsics
+        weights = np.zeros((4, 4))
+        for degrees, weight in CALIBRATION_TERMS.items():
+            weights[degrees] = weight
+        shape = np.polynomial.legendre.leggrid2d(np.linspace(-1, 1, k.height), np.linspace(-1, 1, k.width), weights.T)
+        return np.asarray(shape * (self.noise.calibration_error_m / np.sqrt(np.mean(shape**2))), dtype=np.float32)
+
+    def gray_image(self, seen: Float32Array, rng: np.random.Generator) -> NDArray[np.uint8]:
+        """8-bit image (H, W) of blurred sums under the projector's white light and the room's; display gamma of 2."""
+        light = self.expose(seen[0] + np.float32(self.noise.room_light) * seen[1], rng)
+        return np.asarray(np.round(255 * np.sqrt(np.clip(IMAGE_GAIN * light, 0, 1))), dtype=np.uint8)
+
     def capture(self, sums: Float32Array, rng: np.random.Generator) -> RgbdFrame:
         """Frame that this camera makes of ideal sums of shape (CHANNELS, H, W); its capture name is empty."""
-        seen = self.expose(sums, rng)
-        depth = self.triangulate(self.decode(seen)) + self.smooth_error_m(rng)
+        seen = self.blurred(sums)
+        depth = self.triangulate(self.decode(self.phasors(seen, rng)))
+        depth += self.smooth_error_m(rng) + self.calibration_error_m()
         low, high = self.depth_range_m
         with np.errstate(invalid="ignore"):
             depth = np.where((depth > low) & (depth < high), depth, np.nan)
-        cloud = self.intrinsics.backproject(depth)
-        return RgbdFrame(cloud, gray_image(seen, self.noise, rng), self.intrinsics, None, "", simulated=True)
-
-
-def gray_image(seen: Float32Array, noise: NoiseModel, rng: np.random.Generator) -> NDArray[np.uint8]:
-    """8-bit image (H, W) under the projector's white light and the room's, with a display gamma of 2."""
-    light = seen[0] + np.float32(2 * noise.room_light) * seen[1]
-    light += np.float32(noise.read) * rng.standard_normal(light.shape, dtype=np.float32)
-    return np.asarray(np.round(255 * np.sqrt(np.clip(IMAGE_GAIN * light, 0, 1))), dtype=np.uint8)
+        image = self.gray_image(seen, rng)
+        return RgbdFrame(self.intrinsics.backproject(depth), image, self.intrinsics, None, "", simulated=True)
 
 
 def default_camera(resolution: int = 1376) -> StructuredLightCamera:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,93 +17,121 @@ PROFILE_SPACING_M = 3e-3
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Solid:
-    """A placed tube as discs along its axis and as the plate of its printed cap, rack frame.
+class Turned:
+    """A solid of revolution as discs along its axis, rack frame.
 
     Attributes:
         axis: Unit axis, shape (3,).
-        origin_m: Its bottom, shape (3,), metres.
-        own_m: Profile (z, r) with its own cap, shape (N, 2), metres.
-        bare_m: Profile under a printed cap: a closed cap is off, a flange stays.
-        plate_center_m: Centre of the plate's top, shape (3,).
-        plate_corners_m: Corners of the plate's top, counter-clockwise, shape (4, 3).
+        origin_m: The point of the axis that its heights count from, shape (3,), metres.
+        profile_m: Profile (z, r), shape (N, 2), metres.
     """
 
     axis: FloatArray
     origin_m: FloatArray
-    own_m: FloatArray
-    bare_m: FloatArray
-    plate_center_m: FloatArray
-    plate_corners_m: FloatArray
+    profile_m: FloatArray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Solid:
+    """A placed tube with its own and with its printed cap, as they are made, rack frame.
+
+    Attributes:
+        body: The tube under a printed cap: a closed cap is off, a flange stays.
+        cap: Its own closed cap, or None.
+        plate_axis: Unit normal of the printed cap's plate, shape (3,).
+        plate_top_m: Corners of the plate's top, counter-clockwise, shape (4, 3), metres.
+        plate_bottom_m: Corners of its lower side in the same order, shape (4, 3), metres.
+        center_m: Centre of the plate's top, shape (3,), metres.
+        reach_m: Generous radius about that centre that holds the whole tube, seen from above.
+    """
+
+    body: Turned
+    cap: Turned | None
+    plate_axis: FloatArray
+    plate_top_m: FloatArray
+    plate_bottom_m: FloatArray
+    center_m: FloatArray
+    reach_m: float
 
 
 def solid_of(tube: PlacedTube, cap: CapModel) -> Solid:
     """The shape of a tube with its own and with its printed cap."""
-    T = tube.T_rack_tube
-    half, top = cap.square_m / 2, cap.offset_m(tube.model)
-    corners = np.array([[1, 1, 0], [-1, 1, 0], [-1, -1, 0], [1, -1, 0]]) * half + [0, 0, top]
-    own = tube.model.outer_profile_m(PROFILE_SPACING_M)
-    bare = own if tube.model.is_open else tube.model.body_profile_m(PROFILE_SPACING_M)
+    T, model = tube.T_rack_tube, tube.model
+    profile = (model.outer_profile_m if model.is_open else model.body_profile_m)(PROFILE_SPACING_M)
+    own = None if model.is_open else _turned(T @ tube.T_tube_own_cap, tube.own_cap_profile_m())
+    T_rack_cap = T @ tube.T_tube_cap
+    corners = np.array([[1, 1, 0], [-1, 1, 0], [-1, -1, 0], [1, -1, 0]]) * cap.square_m / 2
+    top = transform_points(T_rack_cap, corners + np.array([0.0, 0.0, cap.offset_m(model)]))
+    plate_axis = T_rack_cap[:3, 2]
+    body = _turned(T, profile)
     return Solid(
-        axis=T[:3, 2],
-        origin_m=T[:3, 3],
-        own_m=own,
-        bare_m=bare,
-        plate_center_m=transform_points(T, np.array([0.0, 0.0, top])),
-        plate_corners_m=transform_points(T @ tube.T_tube_cap, corners),
+        body=body,
+        cap=own,
+        plate_axis=plate_axis,
+        plate_top_m=top,
+        plate_bottom_m=top - cap.thickness_mm * 1e-3 * plate_axis,
+        center_m=top.mean(axis=0),
+        reach_m=_reach_m((body,) if own is None else (body, own), cap),
     )
+
+
+def _turned(T_rack_part: FloatArray, profile_m: FloatArray) -> Turned:
+    return Turned(T_rack_part[:3, 2], T_rack_part[:3, 3], profile_m)
 
 
 def collide(a: Solid, b: Solid, cap: CapModel) -> bool:
     """Whether two tubes touch, with their own caps or with their printed ones."""
-    if np.hypot(*(a.plate_center_m - b.plate_center_m)[:2]) > _reach(a, cap) + _reach(b, cap):
+    if math.dist(a.center_m[:2], b.center_m[:2]) > a.reach_m + b.reach_m:
         return False
-    if _bodies_touch(a, b):
+    if any(_turned_touch(p, q) for p in _own_parts(a) for q in _own_parts(b)):
         return True
-    lean_m = cap.square_m * (np.hypot(*a.axis[:2]) + np.hypot(*b.axis[:2]))
-    level = abs(a.plate_center_m[2] - b.plate_center_m[2]) < cap.thickness_mm * 1e-3 + lean_m
-    if level and polygons_overlap(a.plate_corners_m[:, :2], b.plate_corners_m[:, :2]):
+    lean_m = cap.square_m * (np.hypot(*a.plate_axis[:2]) + np.hypot(*b.plate_axis[:2]))
+    level = abs(a.center_m[2] - b.center_m[2]) < cap.thickness_mm * 1e-3 + lean_m
+    sides = ((a.plate_top_m, b.plate_top_m), (a.plate_bottom_m, b.plate_bottom_m))
+    if level and any(polygons_overlap(p[:, :2], q[:, :2]) for p, q in sides):
         return True
-    return _plate_hits_body(a, b, cap) or _plate_hits_body(b, a, cap)
+    return _plate_hits_body(a, b.body) or _plate_hits_body(b, a.body)
 
 
-def _reach(solid: Solid, cap: CapModel) -> float:
-    """Generous radius about the plate's centre that holds the tube, seen from above."""
-    lean_m = float(np.hypot(*solid.axis[:2])) * solid.own_m[-1, 0]
-    return float(max(solid.own_m[:, 1].max(), cap.square_m * 0.75) + lean_m)
+def _own_parts(solid: Solid) -> tuple[Turned, ...]:
+    return (solid.body,) if solid.cap is None else (solid.body, solid.cap)
 
 
-def _bodies_touch(a: Solid, b: Solid) -> bool:
-    """Compare two profiles (z, r) disc by disc at the heights where either of them turns."""
-    breaks = np.concatenate([a.origin_m[2] + a.own_m[:, 0] * a.axis[2], b.origin_m[2] + b.own_m[:, 0] * b.axis[2]])
+def _reach_m(parts: tuple[Turned, ...], cap: CapModel) -> float:
+    lean_m = max(float(np.hypot(*part.axis[:2])) for part in parts) * float(parts[-1].profile_m[-1, 0])
+    widest = max(float(part.profile_m[:, 1].max()) for part in parts)
+    return max(widest, cap.square_m * 0.75) + lean_m
+
+
+def _turned_touch(a: Turned, b: Turned) -> bool:
+    """Compare two solids of revolution disc by disc at the heights where either of their profiles turns."""
+    breaks = np.concatenate([part.origin_m[2] + part.profile_m[:, 0] * part.axis[2] for part in (a, b)])
     # A leaning cap's edge is up to radius * sin(tilt) off its centre's height: look a little above and below.
     heights = np.concatenate([breaks - 3e-4, breaks + 3e-4])
-    xa, ra = _discs(a, a.own_m, heights)
-    xb, rb = _discs(b, b.own_m, heights)
+    xa, ra = _discs(a, heights)
+    xb, rb = _discs(b, heights)
     both = (ra > 0) & (rb > 0)
     gap = np.linalg.norm(xa - xb, axis=1) - (ra + rb)
     return bool(np.any(gap[both] < CLEARANCE_M))
 
 
-def _discs(solid: Solid, profile: FloatArray, heights_m: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Centres (N, 2) and radii (N,) of a tube's discs at heights of the rack frame; radius 0 off the tube."""
-    along = (heights_m - solid.origin_m[2]) / solid.axis[2]
-    centers = solid.origin_m[:2] + along[:, None] * solid.axis[:2]
+def _discs(part: Turned, heights_m: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Centres (N, 2) and radii (N,) of a solid's discs at heights of the rack frame; radius 0 off the solid."""
+    along = (heights_m - part.origin_m[2]) / part.axis[2]
+    centers = part.origin_m[:2] + along[:, None] * part.axis[:2]
     # At a step of the profile either side may answer: callers look a little above and below it.
-    radii = np.interp(along, profile[:, 0], profile[:, 1], left=0.0, right=0.0)
-    return centers, radii / solid.axis[2]
+    radii = np.interp(along, part.profile_m[:, 0], part.profile_m[:, 1], left=0.0, right=0.0)
+    return centers, radii / part.axis[2]
 
 
-def _plate_hits_body(plate: Solid, body: Solid, cap: CapModel) -> bool:
+def _plate_hits_body(plate: Solid, body: Turned) -> bool:
     """Whether a printed plate cuts into the bare body of a taller neighbour."""
-    heights = plate.plate_center_m[2] - np.linspace(0, cap.thickness_mm * 1e-3, 3)
-    centers, radii = _discs(body, body.bare_m, heights)
-    corners = plate.plate_corners_m[:, :2]
-    return any(
-        _distance_to_polygon(center, corners) < radius + CLEARANCE_M
-        for center, radius in zip(centers, radii, strict=True)
-        if radius > 0
-    )
+    for depth in (0.0, 0.5, 1.0):
+        corners = plate.plate_top_m + depth * (plate.plate_bottom_m - plate.plate_top_m)
+        center, radius = _discs(body, corners[:, 2].mean(keepdims=True))
+        if radius[0] > 0 and _distance_to_polygon(center[0], corners[:, :2]) < radius[0] + CLEARANCE_M:
+            return True
+    return False
 
 
 def _distance_to_polygon(point: FloatArray, corners: FloatArray) -> float:

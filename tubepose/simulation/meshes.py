@@ -97,6 +97,32 @@ def _without_slivers(mesh: Mesh) -> Mesh:
     return Mesh(mesh.vertices_m, mesh.normals, mesh.triangles[area > 0])
 
 
+def wall_patch(
+    low_zr_m: tuple[float, float], high_zr_m: tuple[float, float], start_rad: float, span_rad: float
+) -> Mesh:
+    """Part of a cylinder's or cone's wall about z, facing outwards.
+
+    Args:
+        low_zr_m: Height and radius of the lower edge, metres.
+        high_zr_m: Height and radius of the upper edge.
+        start_rad: Where the patch begins, from x towards y.
+        span_rad: How far it goes around, at most a full turn.
+    """
+    steps = max(1, int(np.ceil(span_rad / (2 * np.pi) * SEGMENTS)))
+    angles = start_rad + np.linspace(0, span_rad, steps + 1)
+    circle = np.column_stack([np.cos(angles), np.sin(angles)])
+    rise, widening = np.subtract(high_zr_m, low_zr_m)
+    across, up = np.array([rise, -widening]) / np.hypot(rise, widening)
+    normals = _ring(circle, across, up)
+    a = np.arange(steps)
+    b, c, d = a + 1, a + steps + 2, a + steps + 1
+    return Mesh(
+        np.concatenate([_ring(circle, r, z) for z, r in (low_zr_m, high_zr_m)]),
+        np.concatenate([normals, normals]),
+        np.concatenate([np.column_stack([a, b, c]), np.column_stack([a, c, d])]),
+    )
+
+
 def box(size_m: Sequence[float], center_m: Sequence[float]) -> Mesh:
     """Axis-parallel box with flat faces; `size_m` and `center_m` are (x, y, z) in metres."""
     half = np.asarray(size_m) / 2

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Sequence
 
 import numpy as np
@@ -15,27 +16,40 @@ from tubepose.simulation.scene import PlacedTube
 from tubepose.transforms import FloatArray, axis_rotation, make_transform, transform_points
 
 MAX_CAP_SPIN_RAD = np.deg2rad(5.0)
-MAX_SCANNER_TILT_RAD = np.deg2rad(20.0)
+SCANNER_TILT_RAD = (0.0, float(np.deg2rad(20.0)))
 DISTANCE_M = (0.60, 0.70)
 MAX_RACK_SHIFT_M = 0.06
 IMAGE_MARGIN = 0.04
 """The rack keeps this share of the image's width away from its border."""
 CAP_ALBEDO = (0.35, 0.85)
-FILL = (0.10, 0.40)
-"""Share of the slots that hold a tube, when the caller does not choose."""
 
 _LEAN_TRIES = 200
-_NEIGHBOUR_TRIES = 30
+_SWEEPS = 2
+_LEANS = 30
 _POSE_TRIES = 500
 
 
 def place_tubes(
-    rack: RackModel, types: Sequence[TubeModel], count: int, cap: CapModel, rng: np.random.Generator
+    rack: RackModel,
+    types: Sequence[TubeModel],
+    count: int,
+    cap: CapModel,
+    rng: np.random.Generator,
+    cap_albedo: tuple[float, float] = CAP_ALBEDO,
 ) -> tuple[PlacedTube, ...]:
-    """Put up to `count` tubes of random types into random slots of a rack.
+    """Put up to `count` perfect tubes of random types into random slots of a rack.
 
-    A tube whose cap, own or printed, would cut into a neighbour's is placed again; after a bounded number of tries its
-    slot stays empty and another slot is tried, so a rack with wide caps may hold fewer than `count`.
+    Tubes come upright, or leaning where their caps, own or printed, would cut into a neighbour's otherwise. Then, twice
+    and in random order, each leans anew as its slot and its neighbours allow. Where no lean of a bounded number fits, a
+    slot stays empty: a rack whose pitch is less than a cap's width holds fewer tubes than `count`.
+
+    Args:
+        rack: The rack.
+        types: Tube types; each tube is of one of them.
+        count: Tubes to place.
+        cap: The printed cap that there must be room for.
+        rng: Source of randomness; poses depend on nothing else but the arguments above.
+        cap_albedo: Least and most brightness of own caps, one value per type.
 
     Raises:
         LabwareError: A type fits into no slot, or is too short to wear the printed cap there.
@@ -46,7 +60,7 @@ def place_tubes(
                 f"tube '{model.name}' cannot stand in rack '{rack.name}' and wear printed cap '{cap.name}' above its "
                 "top; choose a tube that is narrower than the slots and reaches out of them"
             )
-    albedo = {model.name: float(rng.uniform(*CAP_ALBEDO)) for model in types}
+    albedo = {model.name: float(rng.uniform(*cap_albedo)) for model in types}
     placed: list[PlacedTube] = []
     solids: list[Solid] = []
     for i in rng.permutation(len(rack.all_slots)):
@@ -56,16 +70,40 @@ def place_tubes(
         model = types[int(rng.integers(len(types)))]
         if not _fits(rack, slot, model, cap):
             continue
-        for _ in range(_NEIGHBOUR_TRIES):
-            spin = float(rng.uniform(-MAX_CAP_SPIN_RAD, MAX_CAP_SPIN_RAD))
-            tube = PlacedTube(slot.name, model, lean(rack, slot, model, rng), spin, albedo[model.name])
-            solid = solid_of(tube, cap)
-            if not any(collide(solid, other, cap) for other in solids):
-                placed.append(tube)
-                solids.append(solid)
-                break
+        upright = _standing(rack, slot, model, np.zeros(2), np.zeros(2))
+        tube = PlacedTube(slot.name, model, upright, 0.0, albedo[model.name])
+        standing = solid_of(tube, cap)
+        found: tuple[PlacedTube, Solid] | None = (tube, standing)
+        if _collides(standing, solids, cap):
+            found = _leaned(rack, tube, solids, cap, rng)
+        if found is not None:
+            placed.append(found[0])
+            solids.append(found[1])
+    for _ in range(_SWEEPS):
+        for k in rng.permutation(len(placed)):
+            found = _leaned(rack, placed[k], solids[:k] + solids[k + 1 :], cap, rng)
+            if found is not None:
+                placed[k], solids[k] = found
     order = {slot.name: k for k, slot in enumerate(rack.all_slots)}
     return tuple(sorted(placed, key=lambda tube: order[tube.slot]))
+
+
+def _leaned(
+    rack: RackModel, tube: PlacedTube, others: Sequence[Solid], cap: CapModel, rng: np.random.Generator
+) -> tuple[PlacedTube, Solid] | None:
+    """The tube with a random lean and turn of its printed cap that fits beside others, or None."""
+    for _ in range(_LEANS):
+        pose = lean(rack, rack.slot(tube.slot), tube.model, rng)
+        spin = float(rng.uniform(-MAX_CAP_SPIN_RAD, MAX_CAP_SPIN_RAD))
+        leaned = dataclasses.replace(tube, T_rack_tube=pose, cap_spin_rad=spin)
+        solid = solid_of(leaned, cap)
+        if not _collides(solid, others, cap):
+            return leaned, solid
+    return None
+
+
+def _collides(solid: Solid, others: Sequence[Solid], cap: CapModel) -> bool:
+    return any(collide(solid, other, cap) for other in others)
 
 
 def _fits(rack: RackModel, slot: SlotModel, model: TubeModel, cap: CapModel) -> bool:
@@ -124,17 +162,24 @@ def _standing(
     return make_transform(axis_rotation(axis), np.array([*(slot.center_m + offset_m), height]) - pivot * axis)
 
 
-def place_rack(rack: RackModel, tallest_m: float, intrinsics: CameraIntrinsics, rng: np.random.Generator) -> FloatArray:
+def place_rack(
+    rack: RackModel,
+    tallest_m: float,
+    intrinsics: CameraIntrinsics,
+    rng: np.random.Generator,
+    scanner_tilt_rad: tuple[float, float] = SCANNER_TILT_RAD,
+) -> FloatArray:
     """Random T_camera_rack of shape (4, 4) with the whole rack and its tubes in view.
 
-    Any yaw; the camera's axis tilted 0 to 20 deg from the rack's normal about a random axis; the rack's top 0.60 to
-    0.70 m away and off the image's centre.
+    Any yaw; the camera's axis tilted from the rack's normal about a random axis; the rack's top 0.60 to 0.70 m away
+    and off the image's centre.
 
     Args:
         rack: The rack.
         tallest_m: Height of the tallest tube's top above the rack's base.
         intrinsics: Of the camera that must see all of it.
         rng: Source of randomness.
+        scanner_tilt_rad: Least and most angle between the camera's axis and the rack's normal.
 
     Raises:
         LabwareError: The rack is too large for the camera's view.
@@ -145,7 +190,7 @@ def place_rack(rack: RackModel, tallest_m: float, intrinsics: CameraIntrinsics, 
     facing = np.diag([1.0, -1.0, -1.0])
     for _ in range(_POSE_TRIES):
         yaw, about = rng.uniform(0, 2 * np.pi, 2)
-        tilt = rng.uniform(0, MAX_SCANNER_TILT_RAD)
+        tilt = rng.uniform(*scanner_tilt_rad)
         shift = rng.uniform(-MAX_RACK_SHIFT_M, MAX_RACK_SHIFT_M, 2)
         tilted = Rotation.from_rotvec(tilt * np.array([np.cos(about), np.sin(about), 0.0])).as_matrix()
         rotation = tilted @ facing @ Rotation.from_euler("z", yaw).as_matrix()

@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from tubepose.labware import CapModel, RackModel, TubeModel, WallOptics
-from tubepose.simulation.meshes import Mesh, box, flat_polygon, merge, rack_shell, rack_wells, revolve
+from tubepose.simulation.meshes import Mesh, box, flat_polygon, merge, rack_shell, rack_wells, revolve, wall_patch
 from tubepose.transforms import FloatArray, make_transform
 
 PROFILE_SPACING_M = 1.5e-3
 TABLE_HALF_SIZE_M = 0.8
+LABEL_OFFSET_M = 1e-4
+"""The mesh of a label lies this far outside the wall."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,7 +52,9 @@ class Material:
 # Assumptions, chosen to look plausible: no published measurement of this labware is known to us.
 TABLE = Material(0.15)
 RACK = Material(0.50)
-RACK_WELL = Material(0.40, ambient=0.25)
+WELL_ALBEDO = 0.8
+"""Albedo of wells and their ambient light, as shares of the rack's. Sensor `raycast` only."""
+WELL_AMBIENT = 0.25
 PRINTED_CAP = Material(0.80)
 OPAQUE_BODY = Material(0.70)
 TRANSLUCENT = Material(0.25, plastic=Plastic(1.49, 0.40))
@@ -64,7 +68,7 @@ class Finishes:
 
     Attributes:
         table: What the rack stands on.
-        rack: The rack's outside, wells and floors.
+        rack: The rack's outside, wells and floors; `raycast` darkens the wells.
         printed_cap: The printed caps.
         opaque_body: Bodies of opaque tubes.
         cap_roughness: Gloss of the tubes' own caps, as `Material.roughness`.
@@ -76,7 +80,7 @@ class Finishes:
     printed_cap: Material = PRINTED_CAP
     opaque_body: Material = OPAQUE_BODY
     cap_roughness: float | None = 0.35
-    wall_roughness: float = 0.15
+    wall_roughness: float = 0.07
 
 
 @dataclass(frozen=True, slots=True)
@@ -210,20 +214,23 @@ class Scene:
         """Every solid of the scene with its material, camera frame."""
         corners = np.array([[1, 1], [-1, 1], [-1, -1], [1, -1]]) * TABLE_HALF_SIZE_M
         yield flat_polygon([corners], 0.0).transformed(self.T_camera_rack), self.finishes.table
-        yield rack_shell(self.rack).transformed(self.T_camera_rack), RACK
-        yield rack_wells(self.rack).transformed(self.T_camera_rack), RACK_WELL
+        rack = self.finishes.rack
+        well = replace(rack, albedo=WELL_ALBEDO * rack.albedo, ambient=WELL_AMBIENT)
+        yield rack_shell(self.rack).transformed(self.T_camera_rack), rack
+        yield rack_wells(self.rack).transformed(self.T_camera_rack), well
+        materials = self.materials or MATERIALS | {"opaque": self.finishes.opaque_body}
         for tube in self.tubes:
-            for mesh, material in tube_parts(tube, self.printed_cap, self.materials or MATERIALS):
+            for mesh, material in tube_parts(tube, self.printed_cap, materials, self.finishes):
                 yield mesh.transformed(self.T_camera_rack @ tube.T_rack_tube), material
 
 
 def tube_parts(
-    tube: PlacedTube, printed_cap: CapModel | None, materials: dict[str, Material]
+    tube: PlacedTube, printed_cap: CapModel | None, materials: dict[str, Material], finishes: Finishes
 ) -> Iterator[tuple[Mesh, Material]]:
-    """Solids of one tube, tube frame.
+    """Solids of one tube, tube frame, as triangles: body, flange, label, then the cap that it wears.
 
     A flange is part of the tube and stays under a printed cap; a closed cap is taken off for it. A closed cap is
-    opaque whatever its material: light inside a cap is not modelled.
+    opaque whatever its material: light inside a cap is not modelled. Liquids have no triangles.
     """
     model = tube.model
     body = materials[model.body.material]
@@ -236,10 +243,26 @@ def tube_parts(
         profile = model.cap_profile_m()
         bore = np.array([[profile[0, 0], profile[-1, 1]], profile[0]])
         yield revolve(np.vstack([profile, bore])), materials[flange.material]
+    if tube.label is not None:
+        yield label_mesh(tube.label, model), Material(tube.label.albedo)
     if printed_cap is not None:
-        yield printed_cap_mesh(printed_cap, model).transformed(tube.T_tube_cap), PRINTED_CAP
+        yield printed_cap_mesh(printed_cap, model).transformed(tube.T_tube_cap), finishes.printed_cap
     elif model.cap is not None and not model.cap.open:
-        yield revolve(model.cap_profile_m()), Material(tube.cap_albedo)
+        yield own_cap_mesh(tube), Material(tube.cap_albedo, roughness=finishes.cap_roughness)
+
+
+def label_mesh(label: Label, model: TubeModel) -> Mesh:
+    """A label as a patch just outside the wall, tube frame."""
+    low, high = ((z, float(model.body_radius_m(z)) + LABEL_OFFSET_M) for z in (label.low_m, label.high_m))
+    return wall_patch(low, high, label.start_rad, label.span_rad)
+
+
+def own_cap_mesh(tube: PlacedTube) -> Mesh:
+    """A tube's own closed cap as made and as seated, tube frame."""
+    profile = tube.own_cap_profile_m()
+    # A crooked cap leaves no slit around the wall that it sits on: its lower side ends inside that wall.
+    profile[0, 1] -= tube.model.body.wall_mm * 0.5e-3
+    return revolve(profile).transformed(tube.T_tube_own_cap)
 
 
 def printed_cap_mesh(cap: CapModel, model: TubeModel) -> Mesh:

@@ -2,24 +2,41 @@
 
 from __future__ import annotations
 
+from math import inf
 from pathlib import Path
 from typing import Annotated, Any
 
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field
+from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field
 
 from tubepose.errors import ConfigError
 from tubepose.labware.reading import read_yaml, validate
 
 
-def _in_order(value: tuple[float, float]) -> tuple[float, float]:
-    if not 0 <= value[0] <= value[1]:
-        raise ValueError(f"expected [least, most] with 0 <= least <= most, found {list(value)}")
+def _two(value: Any) -> Any:
+    if not isinstance(value, list | tuple) or len(value) != 2:
+        raise ValueError(f"expected [least, most], found {value!r}")
     return value
 
 
-Range = Annotated[tuple[float, float], AfterValidator(_in_order)]
+def _range(least: float, most: float) -> AfterValidator:
+    def check(value: tuple[float, float]) -> tuple[float, float]:
+        if not least <= value[0] <= value[1] <= most:
+            bounds = f"{least:g} <= least <= most" + (f" <= {most:g}" if most < inf else "")
+            raise ValueError(f"expected [least, most] with {bounds}, found {list(value)}")
+        return value
+
+    return AfterValidator(check)
+
+
+Finite = Annotated[float, Field(allow_inf_nan=False)]
+Pair = Annotated[tuple[Finite, Finite], BeforeValidator(_two)]
+Range = Annotated[Pair, _range(0.0, inf)]
+ShareRange = Annotated[Pair, _range(0.0, 1.0)]
+IndexRange = Annotated[Pair, _range(1.0, 2.5)]
+TiltRange = Annotated[Pair, _range(0.0, 60.0)]
+RoughnessRange = Annotated[Pair, _range(0.01, 1.0)]
 Share = Annotated[float, Field(ge=0.0, le=1.0)]
-Spread = Annotated[float, Field(ge=0.0)]
+Spread = Annotated[float, Field(ge=0.0, allow_inf_nan=False)]
 
 
 class Tolerances(BaseModel):
@@ -43,14 +60,14 @@ class SceneVariation(BaseModel):
     """Ranges of a session's scenes; every value is drawn uniformly, once per trial unless said otherwise.
 
     Attributes:
-        fill: Share of the slots that hold a tube.
+        fill: Share of the slots that hold a tube; at least one does.
         scanner_tilt_deg: Angle between the camera's axis and the rack's normal.
         scattering_per_mm: Of see-through walls, one value per trial; null keeps what the labware files say.
         absorption_per_mm: As `scattering_per_mm`.
         refractive_index: As `scattering_per_mm`.
         liquid_share: Share of the tubes that hold liquid, up to a level between 0.2 and 0.8 of the cavity.
         liquid_absorption_per_m: Absorption of the liquid, per tube.
-        label_share: Share of the tubes that wear a paper label.
+        label_share: Share of the tubes that wear a paper label; a tube without 5 mm of straight wall wears none.
         rack_albedo: Brightness of the rack.
         table_albedo: Brightness of the table.
         printed_cap_albedo: Brightness of the printed caps.
@@ -62,21 +79,21 @@ class SceneVariation(BaseModel):
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
-    fill: Range = (0.10, 0.40)
-    scanner_tilt_deg: Range = (0.0, 20.0)
+    fill: ShareRange = (0.10, 0.40)
+    scanner_tilt_deg: TiltRange = (0.0, 20.0)
     scattering_per_mm: Range | None = None
     absorption_per_mm: Range | None = None
-    refractive_index: Range | None = None
+    refractive_index: IndexRange | None = None
     liquid_share: Share = 0.0
     liquid_absorption_per_m: Range = (1.0, 10.0)
     label_share: Share = 0.0
-    rack_albedo: Range = (0.50, 0.50)
-    table_albedo: Range = (0.15, 0.15)
-    printed_cap_albedo: Range = (0.80, 0.80)
-    cap_albedo: Range = (0.35, 0.85)
-    label_albedo: Range = (0.70, 0.90)
-    gloss_roughness: Range = (0.30, 0.60)
-    wall_roughness: Range = (0.10, 0.20)
+    rack_albedo: ShareRange = (0.50, 0.50)
+    table_albedo: ShareRange = (0.15, 0.15)
+    printed_cap_albedo: ShareRange = (0.80, 0.80)
+    cap_albedo: ShareRange = (0.35, 0.85)
+    label_albedo: ShareRange = (0.70, 0.90)
+    gloss_roughness: RoughnessRange = (0.30, 0.60)
+    wall_roughness: RoughnessRange = (0.05, 0.10)
     tolerances: Tolerances = Tolerances()
 
 
