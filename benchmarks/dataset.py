@@ -109,8 +109,10 @@ def record(place: Path, manifest: Path, name: str, source: str, split: Split, re
     print(f"{name}: {len(entry.files)} files, {entry.bytes} bytes, in {manifest}", file=sys.stderr)
 
 
-def cut_sample(session: Path, sample: Path, trials: int) -> None:
+def cut_sample(session: Path, sample: Path, trials: int, most_tubes: int) -> None:
     """Make the sample from the first trials of each tube of a session, in the place of the one that is there.
+
+    Trials with more than `most_tubes` tubes are passed over: a demonstration should be quick, and show the rack.
 
     Raises:
         CaptureError: The session cannot be read.
@@ -120,7 +122,8 @@ def cut_sample(session: Path, sample: Path, trials: int) -> None:
     groups: dict[str, list[dict[str, Any]]] = {}
     for trial in data["trials"]:
         groups.setdefault(trial["name"].rsplit("-", 1)[0], []).append(trial)
-    kept = [trial for group in groups.values() for trial in group[:trials]]
+    small = [[trial for trial in group if len(trial["tubes"]) <= most_tubes] for group in groups.values()]
+    kept = [trial for group in small for trial in group[:trials]]
     aside, old = (sample.with_name(f".{sample.name}.{word}") for word in ("part", "old"))
     for folder in (aside, old):
         shutil.rmtree(folder, ignore_errors=True)
@@ -168,9 +171,9 @@ def make_sample(options: argparse.Namespace, recipe: Recipe) -> None:
     """Cut the sample; record it if it lies in its place."""
     root = options.manifest.resolve().parent
     place = root / "tubepose" / "sample"
-    cut_sample(options.session or root / "data" / "dev", options.out or place, options.trials)
+    cut_sample(options.session or root / "data" / "dev", options.out or place, options.trials, options.most_tubes)
     if options.out is None:
-        source = f"python -m benchmarks.dataset sample --trials {options.trials}"
+        source = f"python -m benchmarks.dataset sample --trials {options.trials} --most-tubes {options.most_tubes}"
         record(place, options.manifest, "sample", source, "dev", recipe)
 
 
@@ -198,6 +201,7 @@ def parser() -> argparse.ArgumentParser:
             one.add_argument("--sensor", required=True)
     sample = commands.add_parser("sample")
     sample.add_argument("--trials", type=int, default=1, help="per tube")
+    sample.add_argument("--most-tubes", type=int, default=99, help="pass over trials with more")
     sample.add_argument("--session", type=Path)
     sample.add_argument("--out", type=Path)
     return whole

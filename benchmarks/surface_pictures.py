@@ -20,7 +20,7 @@ from benchmarks.surfaces import SENSORS, SET_UPS, SetUp, Truth, pixel_rays, trut
 from tubepose.capture.frame import RgbdFrame
 from tubepose.simulation.camera import StructuredLightCamera, default_camera
 from tubepose.simulation.scene import Scene
-from tubepose.simulation.structured_light.intersection import FLAT, LINE
+from tubepose.simulation.structured_light.codes import FLAT, LINE
 from tubepose.simulation.structured_light.parts import scene_parts
 from tubepose.transforms import FloatArray, invert_transform, transform_points
 

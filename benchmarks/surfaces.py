@@ -29,16 +29,8 @@ from tubepose.simulation import raycast, structured_light
 from tubepose.simulation.camera import StructuredLightCamera, default_camera
 from tubepose.simulation.random_scene import random_scene
 from tubepose.simulation.scene import Scene
-from tubepose.simulation.structured_light.intersection import (
-    BOX,
-    CAVITY,
-    FLAT,
-    NOTHING,
-    OPAQUE,
-    RACK_TOP,
-    REVOLVED,
-    first_hits,
-)
+from tubepose.simulation.structured_light.codes import BOX, CAVITY, FLAT, NOTHING, OPAQUE, RACK_TOP, REVOLVED
+from tubepose.simulation.structured_light.intersection import first_hits
 from tubepose.simulation.structured_light.shapes import Shapes, shapes_of
 from tubepose.simulation.variation import SceneVariation
 from tubepose.transforms import FloatArray, invert_transform, make_transform, transform_points
@@ -53,16 +45,8 @@ MILKY_PER_M = 100.0
 SAME_M = 2e-5
 """A ray from the projector that ends within this of a point lights it."""
 OFF_MM = (1.0, 2.0)
-SURFACES = (
-    "cap top",
-    "cap side",
-    "printed cap top",
-    "rim",
-    "outer wall, milky",
-    "outer wall, clear",
-    "inner wall",
-    "rack top",
-)
+OUTER_WALLS = ("outer wall, milky", "outer wall, clear")
+SURFACES = ("cap top", "cap side", "printed cap top", "rim", *OUTER_WALLS, "inner wall", "rack top")
 CAP_TOP, CAP_SIDE, PRINTED_TOP, RIM, MILKY_WALL, CLEAR_WALL, INNER_WALL, TOP = range(len(SURFACES))
 SENSORS = {"structured-light": structured_light.render, "raycast": raycast.render}
 

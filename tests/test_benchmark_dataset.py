@@ -133,10 +133,13 @@ def test_the_sample_is_the_first_trials_of_every_tube(run, tmp_path: Path) -> No
             assert (sample.folder / place).read_bytes() == (whole.folder / place).read_bytes()
         assert read_exact_truth(sample.folder, trial.name).tubes.keys() == trial.tubes.keys()
     entry = sets(tmp_path)["sample"]
-    assert (entry.split, entry.source) == ("dev", "python -m benchmarks.dataset sample --trials 1")
+    assert (entry.split, entry.source) == ("dev", "python -m benchmarks.dataset sample --trials 1 --most-tubes 99")
     assert check_data_set(entry, tmp_path).state == "ok"
     assert len(entry.files) == 4 + 2 + 1
     assert [path.name for path in (tmp_path / "tubepose").iterdir()] == ["sample"]
+    most = min(len(trial.tubes) for trial in whole.trials)
+    assert run("sample", "--most-tubes", str(most), "--out", str(tmp_path / "few")) == 0
+    assert {len(trial.tubes) for trial in load_session(tmp_path / "few").trials} == {most}
 
 
 def test_what_cannot_be_done_is_said(run, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

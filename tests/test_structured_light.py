@@ -4,8 +4,8 @@ import dataclasses
 
 import numpy as np
 import pytest
-from scipy.spatial.transform import Rotation
 from scenes import tube_pose
+from scipy.spatial.transform import Rotation
 
 from tubepose.capture.frame import CameraIntrinsics
 from tubepose.labware import WallOptics, load_cap, load_rack, load_tube
@@ -13,7 +13,8 @@ from tubepose.simulation import raycast
 from tubepose.simulation.camera import NO_NOISE, default_camera
 from tubepose.simulation.scene import Finishes, Liquid, Material, PlacedTube, Scene
 from tubepose.simulation.structured_light import light_map, optics, parts, paths, photons, sensor, shapes
-from tubepose.simulation.structured_light.intersection import OUTSIDE, first_hits
+from tubepose.simulation.structured_light.codes import OUTSIDE
+from tubepose.simulation.structured_light.intersection import first_hits
 from tubepose.simulation.structured_light.parts import BoxPart, Piece, RevolvedPart
 from tubepose.simulation.structured_light.projector import Projector, projector_of, towards
 from tubepose.transforms import invert_transform, make_transform, transform_points

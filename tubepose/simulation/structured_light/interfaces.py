@@ -4,22 +4,9 @@ from __future__ import annotations
 
 import math
 
-from numba import njit
-
-from tubepose.simulation.structured_light.compiled import COMPILE, INLINE
-from tubepose.simulation.structured_light.intersection import (
-    CAVITY,
-    BOX,
-    LIQUID,
-    NOTHING,
-    OPAQUE,
-    REVOLVED,
-    TABLE,
-    closest,
-    hit_own,
-    into,
-    turned_into,
-)
+from tubepose.simulation.structured_light.codes import BOX, CAVITY, LIQUID, NOTHING, OPAQUE, REVOLVED, TABLE
+from tubepose.simulation.structured_light.compiled import inlined, kernel
+from tubepose.simulation.structured_light.intersection import closest, hit_own, into, turned_into
 from tubepose.simulation.structured_light.optics import (
     COAT_INDEX,
     cosine_direction,
@@ -38,7 +25,7 @@ LEAST_GLOSSY = 0.15
 _FAR = 1e30
 
 
-@njit(**COMPILE)
+@kernel
 def next_hit(s, medium, inside, ox, oy, oz, dx, dy, dz):
     """First surface that light meets; within plastic or liquid only the solid `inside` can be met."""
     if medium == AIR:
@@ -51,7 +38,7 @@ def next_hit(s, medium, inside, ox, oy, oz, dx, dy, dz):
     return t, REVOLVED if found >= 0 else LIQUID, found, inside
 
 
-@njit(**INLINE)
+@inlined
 def is_opaque(s, code, index):
     """Whether a hit ends at an opaque surface."""
     if code == LIQUID:
@@ -59,7 +46,7 @@ def is_opaque(s, code, index):
     return code != REVOLVED or s.segment_type[index] == OPAQUE
 
 
-@njit(**INLINE)
+@inlined
 def material_of(s, code, index, owner):
     """Row of `s.materials` of a hit on an opaque surface."""
     if code == TABLE:
@@ -71,7 +58,7 @@ def material_of(s, code, index, owner):
     return RACK_MATERIAL
 
 
-@njit(**INLINE)
+@inlined
 def coat_of(s, material, wetted, cosine):
     """Share of light that the glossy coat of a surface reflects at a cosine of incidence; 0 for a matte one.
 
@@ -82,7 +69,7 @@ def coat_of(s, material, wetted, cosine):
     return fresnel(cosine, 1.0, COAT_INDEX)
 
 
-@njit(**COMPILE)
+@kernel
 def bounced(s, state, material, wetted, dx, dy, dz, nx, ny, nz):
     """Random direction in which an opaque surface sends light on, and its weight: BRDF times cosine over density.
 
@@ -102,7 +89,7 @@ def bounced(s, state, material, wetted, dx, dy, dz, nx, ny, nz):
     return ex, ey, ez, (1.0 - coat) * albedo / (1.0 - glossy)
 
 
-@njit(**INLINE)
+@inlined
 def attenuation(s, medium, inside):
     """Scattering and absorption coefficient of a medium, per metre."""
     if medium == PLASTIC:
@@ -112,7 +99,7 @@ def attenuation(s, medium, inside):
     return 0.0, 0.0
 
 
-@njit(**INLINE)
+@inlined
 def index_of(s, medium, inside):
     """Refractive index of a medium."""
     if medium == PLASTIC:
@@ -120,17 +107,25 @@ def index_of(s, medium, inside):
     return s.solids[inside, 23] if medium == IN_LIQUID else 1.0
 
 
-@njit(**COMPILE)
+@kernel
 def cross(s, state, code, index, owner, x, y, z, dx, dy, dz, nx, ny, nz):
     """Reflect or refract at random at an interface (Fresnel's share).
 
     Args:
         s: The scene.
         state: Random numbers.
-        code, index, owner: The hit.
-        x, y, z: Where, rack frame.
-        dx, dy, dz: Direction of flight.
-        nx, ny, nz: Unit normal out of the plastic, or up from the liquid.
+        code: Of the hit, as from `closest`.
+        index: Of the hit: the segment.
+        owner: Of the hit: the solid.
+        x: Where, rack frame.
+        y: See x.
+        z: See x.
+        dx: Unit direction of flight.
+        dy: See dx.
+        dz: See dx.
+        nx: Unit normal out of the plastic, or up from the liquid.
+        ny: See nx.
+        nz: See nx.
 
     Returns:
         The new direction and the medium that it leads through.

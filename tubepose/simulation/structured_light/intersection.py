@@ -7,115 +7,27 @@ from __future__ import annotations
 
 import math
 
-from numba import njit
+from tubepose.simulation.structured_light.codes import (
+    BOX,
+    FLAT,
+    LINE,
+    LIQUID,
+    NOTHING,
+    RACK_SIDE,
+    REVOLVED,
+    SPHERE,
+    TABLE,
+    WELL_WALL,
+)
+from tubepose.simulation.structured_light.compiled import inlined, kernel
+from tubepose.simulation.structured_light.rack_intersection import hit_rack, well_normal
 
-from tubepose.simulation.structured_light.compiled import COMPILE, INLINE
-
-NOTHING, TABLE, RACK_TOP, RACK_SIDE, WELL_WALL, WELL_FLOOR, REVOLVED, BOX, LIQUID = range(9)
-OPAQUE, OUTSIDE, CAVITY = range(3)
-LINE, FLAT, SPHERE = range(3)
 # Hits nearer than this are the surface that the ray leaves.
 NEAREST_M = 1e-7
-_TOP_MARGIN_M = 1e-9
 _FAR = 1e30
 
 
-@njit(**INLINE)
-def slot_at(s, x, y):
-    """The slot whose opening holds a point of the rack frame, or -1."""
-    column, row = int(math.floor((x - s.grid[0]) / s.grid[2])), int(math.floor((y - s.grid[1]) / s.grid[2]))
-    if column < 0 or row < 0 or column >= s.cells[0] or row >= s.cells[1]:
-        return -1
-    cell = row * s.cells[0] + column
-    for i in range(s.slot_start[cell], s.slot_start[cell + 1]):
-        k = s.slot_list[i]
-        hx, hy, radius = s.slots[k, 2], s.slots[k, 3], s.slots[k, 4]
-        qx, qy = abs(x - s.slots[k, 0]), abs(y - s.slots[k, 1])
-        if qx < hx and qy < hy:
-            px, py = qx - (hx - radius), qy - (hy - radius)
-            if px <= 0.0 or py <= 0.0 or px * px + py * py < radius * radius:
-                return k
-    return -1
-
-
-@njit(**INLINE)
-def _nearest_slot(s, x, y):
-    """The slot whose centre is nearest, in units of its size: for points that rounding has put on a well's wall."""
-    best, found = _FAR, -1
-    for k in range(len(s.slots)):
-        away = max(abs(x - s.slots[k, 0]) / s.slots[k, 2], abs(y - s.slots[k, 1]) / s.slots[k, 3])
-        if away < best:
-            best, found = away, k
-    return found if best < 1.001 else -1
-
-
-@njit(**INLINE)
-def _out_of_well(s, k, ox, oy, oz, dx, dy, dz):
-    """Where a ray that is, or comes, inside a well meets its wall or floor: distance and code."""
-    hx, hy, radius = s.slots[k, 2], s.slots[k, 3], s.slots[k, 4]
-    qx, qy = ox - s.slots[k, 0], oy - s.slots[k, 1]
-    tx = ((hx if dx > 0.0 else -hx) - qx) / dx if abs(dx) > 1e-14 else _FAR
-    ty = ((hy if dy > 0.0 else -hy) - qy) / dy if abs(dy) > 1e-14 else _FAR
-    t = min(tx, ty)
-    if radius > 0.0 and t < _FAR:
-        px, py = qx + t * dx, qy + t * dy
-        if abs(px) > hx - radius and abs(py) > hy - radius:
-            mx = qx - (hx - radius if px > 0.0 else radius - hx)
-            my = qy - (hy - radius if py > 0.0 else radius - hy)
-            a, b, c = dx * dx + dy * dy, mx * dx + my * dy, mx * mx + my * my - radius * radius
-            t = (-b + math.sqrt(max(0.0, b * b - a * c))) / a
-    if dz < 0.0:
-        to_floor = (s.rack[3] - oz) / dz
-        if to_floor < t:
-            return to_floor, WELL_FLOOR
-    if oz + t * dz > s.rack[2]:
-        return _FAR, NOTHING
-    return t, WELL_WALL
-
-
-@njit(**COMPILE)
-def hit_rack(s, ox, oy, oz, dx, dy, dz):
-    """Distance, code and index (slot, or side 0 to 3) of the rack's surface that a ray meets first."""
-    hx, hy, height = s.rack[0], s.rack[1], s.rack[2]
-    if hx <= 0.0:
-        return _FAR, NOTHING, -1
-    if oz < height - _TOP_MARGIN_M and abs(ox) < hx - 1e-9 and abs(oy) < hy - 1e-9:
-        k = slot_at(s, ox, oy)
-        if k < 0:
-            k = _nearest_slot(s, ox, oy)
-        if k < 0:
-            return _FAR, NOTHING, -1
-        t, code = _out_of_well(s, k, ox, oy, oz, dx, dy, dz)
-        return t, code, k
-    enter, leave, axis = -_FAR, _FAR, -1
-    for i in range(3):
-        o, d = (ox, dx) if i == 0 else ((oy, dy) if i == 1 else (oz, dz))
-        low, high = (-hx, hx) if i == 0 else ((-hy, hy) if i == 1 else (0.0, height))
-        if abs(d) < 1e-14:
-            if o <= low or o >= high:
-                return _FAR, NOTHING, -1
-            continue
-        near, far = (low - o) / d, (high - o) / d
-        if near > far:
-            near, far = far, near
-        if near > enter:
-            enter, axis = near, i
-        leave = min(leave, far)
-    if enter < 1e-9 or enter >= leave:
-        return _FAR, NOTHING, -1
-    if axis == 2:
-        if dz > 0.0:
-            return _FAR, NOTHING, -1
-        k = slot_at(s, ox + enter * dx, oy + enter * dy)
-        if k < 0:
-            return enter, RACK_TOP, -1
-        t, code = _out_of_well(s, k, ox, oy, oz, dx, dy, dz)
-        return t, code, k
-    side = 2 * axis + (0 if (dx if axis == 0 else dy) < 0.0 else 1)
-    return enter, RACK_SIDE, side
-
-
-@njit(**INLINE)
+@inlined
 def _hit_segment(seg, ox, oy, oz, dx, dy, dz, limit):
     """Distance to one segment of a surface of revolution about z, object frame; `limit` or more is no hit."""
     kind = seg[0]
@@ -165,7 +77,7 @@ def _hit_segment(seg, ox, oy, oz, dx, dy, dz, limit):
     return _FAR
 
 
-@njit(**INLINE)
+@inlined
 def hit_own(s, k, ox, oy, oz, dx, dy, dz, limit):
     """Distance and segment of one solid of revolution, object frame; segment -2 is the surface of its liquid."""
     best, found = limit, -1
@@ -186,7 +98,7 @@ def hit_own(s, k, ox, oy, oz, dx, dy, dz, limit):
     return best, found
 
 
-@njit(**INLINE)
+@inlined
 def into(s, k, x, y, z):
     """A point of the rack frame in the frame of solid k."""
     m = s.solids[k]
@@ -197,21 +109,21 @@ def into(s, k, x, y, z):
     )
 
 
-@njit(**INLINE)
+@inlined
 def turned_into(s, k, x, y, z):
     """A direction of the rack frame in the frame of solid k."""
     m = s.solids[k]
     return m[0] * x + m[1] * y + m[2] * z, m[3] * x + m[4] * y + m[5] * z, m[6] * x + m[7] * y + m[8] * z
 
 
-@njit(**INLINE)
+@inlined
 def turned_back(s, k, x, y, z):
     """A direction of the frame of solid k in the rack frame."""
     m = s.solids[k]
     return m[0] * x + m[3] * y + m[6] * z, m[1] * x + m[4] * y + m[7] * z, m[2] * x + m[5] * y + m[8] * z
 
 
-@njit(**INLINE)
+@inlined
 def _hit_solid(s, k, ox, oy, oz, dx, dy, dz, limit):
     px, py, pz = into(s, k, ox, oy, oz)
     ex, ey, ez = turned_into(s, k, dx, dy, dz)
@@ -223,7 +135,7 @@ def _hit_solid(s, k, ox, oy, oz, dx, dy, dz, limit):
     return hit_own(s, k, px, py, pz, ex, ey, ez, limit)
 
 
-@njit(**INLINE)
+@inlined
 def _hit_box(s, k, ox, oy, oz, dx, dy, dz, limit):
     """Distance and face (2 axis + (0 for the low side, 1 for the high one)) of a box, seen from outside or inside."""
     m = s.boxes[k]
@@ -253,9 +165,9 @@ def _hit_box(s, k, ox, oy, oz, dx, dy, dz, limit):
     return _FAR, -1
 
 
-@njit(**COMPILE)
+@kernel
 def _hit_items(s, ox, oy, oz, dx, dy, dz, limit, any_hit):
-    """Nearest tube, cap or box: distance, code, index of segment or face, solid or box. Walks the cells under the ray."""
+    """Nearest tube, cap or box: distance, code, segment or face, solid or box. Walks the cells under the ray."""
     best, code, index, owner = limit, NOTHING, -1, -1
     t0, t1 = 0.0, limit
     # Clip to the box that holds all items.
@@ -306,7 +218,7 @@ def _hit_items(s, ox, oy, oz, dx, dy, dz, limit, any_hit):
             return best, code, index, owner
 
 
-@njit(**COMPILE)
+@kernel
 def closest(s, ox, oy, oz, dx, dy, dz):
     """First surface that a ray meets: distance, code, index (segment, face, slot or side), owner (solid or box)."""
     best, code, index = hit_rack(s, ox, oy, oz, dx, dy, dz)
@@ -320,7 +232,7 @@ def closest(s, ox, oy, oz, dx, dy, dz):
     return best, code, index, -1
 
 
-@njit(**COMPILE)
+@kernel
 def blocked(s, ox, oy, oz, dx, dy, dz, distance):
     """Whether anything, see-through or not, lies on the way within a distance."""
     if hit_rack(s, ox, oy, oz, dx, dy, dz)[0] < distance:
@@ -328,7 +240,7 @@ def blocked(s, ox, oy, oz, dx, dy, dz, distance):
     return _hit_items(s, ox, oy, oz, dx, dy, dz, distance, True)[1] != NOTHING
 
 
-@njit(**INLINE)
+@inlined
 def segment_normal(s, i, x, y, z):
     """Unit normal out of the solid at a point of segment i, object frame."""
     seg = s.segments[i]
@@ -341,21 +253,7 @@ def segment_normal(s, i, x, y, z):
     return x * k, y * k, seg[8]
 
 
-@njit(**INLINE)
-def well_normal(s, k, x, y):
-    """Unit normal into the well, across z, at a point on the wall of slot k."""
-    hx, hy, radius = s.slots[k, 2], s.slots[k, 3], s.slots[k, 4]
-    qx, qy = x - s.slots[k, 0], y - s.slots[k, 1]
-    px, py = abs(qx) - (hx - radius), abs(qy) - (hy - radius)
-    if px > 0.0 and py > 0.0:
-        away = 1.0 / math.sqrt(px * px + py * py)
-        return -math.copysign(px * away, qx), -math.copysign(py * away, qy)
-    if hx - abs(qx) < hy - abs(qy):
-        return -math.copysign(1.0, qx), 0.0
-    return 0.0, -math.copysign(1.0, qy)
-
-
-@njit(**COMPILE)
+@kernel
 def normal_at(s, code, index, owner, x, y, z):
     """Unit normal of a hit in the rack frame; out of a solid, up from a liquid."""
     if code == REVOLVED:
@@ -375,7 +273,7 @@ def normal_at(s, code, index, owner, x, y, z):
     return 0.0, 0.0, 1.0
 
 
-@njit(**COMPILE)
+@kernel
 def first_hits(s, origins, directions, distance, code, index, owner):
     """Fill what N rays meet first; arrays of shape (N, 3) in, (N,) out. A miss has the code NOTHING."""
     for i in range(len(origins)):

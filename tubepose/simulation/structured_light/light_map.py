@@ -11,22 +11,13 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
-from tubepose.simulation.structured_light.compiled import COMPILE, INLINE
-from tubepose.simulation.structured_light.intersection import (
-    BOX,
-    FLAT,
-    RACK_SIDE,
-    RACK_TOP,
-    REVOLVED,
-    WELL_FLOOR,
-    WELL_WALL,
-    into,
-    well_normal,
-)
+from tubepose.simulation.structured_light.codes import BOX, FLAT, RACK_SIDE, RACK_TOP, REVOLVED, WELL_FLOOR, WELL_WALL
+from tubepose.simulation.structured_light.compiled import inlined, kernel
+from tubepose.simulation.structured_light.intersection import into
 from tubepose.simulation.structured_light.parts import PROFILE_STEP_M
+from tubepose.simulation.structured_light.rack_intersection import well_normal
 from tubepose.simulation.structured_light.shapes import Shapes
 from tubepose.transforms import FloatArray
 
@@ -44,8 +35,8 @@ class LightMap(NamedTuple):
     """Texels of all patches in one array.
 
     Attributes:
-        patches: First texel, texels along u and v, layers, 1 if u goes round; shape (P, 5). Patches are, in order: table,
-            rack top, four rack sides, five per slot (walls facing -x, +x, -y, +y as seen by `well_side`, floor), six per
+        patches: First texel, texels along u and v, layers, 1 if u goes round; shape (P, 5). Patches are, in order:
+            table, rack top, four rack sides, five per slot (the walls that face +x, -x, +y, -y, and the floor), six per
             box, one per segment, one per solid (its wall).
         scale: Least u, texels per u, least v, texels per v, shape (P, 4); u and v are metres or radians.
         light: Power, its cosine and sine sums for the three periods, and the area (volume) that belongs to the texel,
@@ -139,9 +130,9 @@ def _blocks(mask: NDArray[np.bool_], nu: int, nv: int) -> FloatArray:
 
 def _in_opening(slot: FloatArray, qx: FloatArray, qy: FloatArray) -> NDArray[np.bool_]:
     px, py = np.abs(qx) - (slot[2] - slot[4]), np.abs(qy) - (slot[3] - slot[4])
-    return (np.hypot(np.maximum(px, 0), np.maximum(py, 0)) < slot[4]) | (
-        (np.maximum(px, py) < slot[4]) & (np.minimum(px, py) <= 0)
-    )
+    corner = np.hypot(np.maximum(px, 0), np.maximum(py, 0)) < slot[4]
+    side = (np.maximum(px, py) < slot[4]) & (np.minimum(px, py) <= 0)
+    return np.asarray(corner | side, dtype=bool)
 
 
 def _wall_lengths(slot: FloatArray, side: int, n: int) -> FloatArray:
@@ -197,7 +188,7 @@ def _wall_texels(profile: FloatArray) -> tuple[int, int, FloatArray]:
     return nu, nv, np.repeat(np.array(volumes)[:, :, None] / nu, nu, axis=2)
 
 
-@njit(**INLINE)
+@inlined
 def locate(s, code, index, owner, x, y, z):
     """Patch and its coordinates u, v of a hit on an opaque surface, rack frame."""
     if code == RACK_TOP:
@@ -226,13 +217,13 @@ def locate(s, code, index, owner, x, y, z):
     return 0, x, y
 
 
-@njit(**INLINE)
+@inlined
 def wall_patch(s, k):
     """The patch of the wall of solid k."""
     return 6 + 5 * len(s.slots) + 6 * len(s.boxes) + len(s.segments) + k
 
 
-@njit(**INLINE)
+@inlined
 def wall_depth(s, k, r, z):
     """Where a point of the object frame lies in the wall of solid k: 0 at the cavity, 1 outside."""
     first, last = s.profile_start[k], s.profile_start[k + 1] - 1
@@ -241,7 +232,7 @@ def wall_depth(s, k, r, z):
     return min(max((r - inner) / max(outer - inner, 1e-9), 0.0), 1.0)
 
 
-@njit(**INLINE)
+@inlined
 def texel(m, patch, u, v, w):
     """The texel that holds a point, or -1 outside the patch."""
     nu, nv, layers = m.patches[patch, 1], m.patches[patch, 2], m.patches[patch, 3]
@@ -254,7 +245,7 @@ def texel(m, patch, u, v, w):
     return m.patches[patch, 0] + (layer * nv + j) * nu + i
 
 
-@njit(**COMPILE)
+@kernel
 def gather(m, patch, u, v, w, weight, sums):
     """Add `weight` times the map's power per area (fluence) at a point to sums (8,): power, -, cosines and sines."""
     nu, nv, layers = m.patches[patch, 1], m.patches[patch, 2], m.patches[patch, 3]

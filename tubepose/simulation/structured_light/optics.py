@@ -9,9 +9,8 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 
-from tubepose.simulation.structured_light.compiled import COMPILE, INLINE
+from tubepose.simulation.structured_light.compiled import inlined, kernel
 
 COAT_INDEX = 1.5
 _GOLDEN = np.uint64(0x9E3779B97F4A7C15)
@@ -20,7 +19,7 @@ _S11, _S27, _S30, _S31 = np.uint64(11), np.uint64(27), np.uint64(30), np.uint64(
 _TO_UNIT = 1.0 / 9007199254740992.0
 
 
-@njit(**INLINE)
+@inlined
 def mixed(x):
     """64 well-mixed bits of 64 bits (the finaliser of SplitMix64)."""
     x = (x ^ (x >> _S30)) * _MIX1
@@ -28,20 +27,20 @@ def mixed(x):
     return x ^ (x >> _S31)
 
 
-@njit(**INLINE)
+@inlined
 def start(state, seed, stream, number):
     """Set a generator's state (array of one uint64) to the stream of one pixel or photon: no two share numbers."""
     state[0] = mixed(mixed(mixed(np.uint64(seed)) + np.uint64(stream) * _GOLDEN) + np.uint64(number) * _GOLDEN)
 
 
-@njit(**INLINE)
+@inlined
 def uniform(state):
     """Next random number in [0, 1) (SplitMix64)."""
     state[0] = state[0] + _GOLDEN
     return (mixed(state[0]) >> _S11) * _TO_UNIT
 
 
-@njit(**INLINE)
+@inlined
 def fresnel(cos_in, index_in, index_out):
     """Reflected share of unpolarised light at a smooth interface; 1 at total reflection.
 
@@ -60,9 +59,9 @@ def fresnel(cos_in, index_in, index_out):
     return 0.5 * (across * across + along * along)
 
 
-@njit(**INLINE)
+@inlined
 def refracted(dx, dy, dz, nx, ny, nz, cos_in, ratio):
-    """Direction behind an interface (Snell); `n` faces the ray, `ratio` is index_in / index_out, no total reflection."""
+    """Direction behind an interface (Snell), no total reflection; `n` faces the ray, `ratio` is index in over out."""
     cos_out = math.sqrt(max(0.0, 1.0 - ratio * ratio * (1.0 - cos_in * cos_in)))
     k = ratio * cos_in - cos_out
     x, y, z = ratio * dx + k * nx, ratio * dy + k * ny, ratio * dz + k * nz
@@ -70,7 +69,7 @@ def refracted(dx, dy, dz, nx, ny, nz, cos_in, ratio):
     return x * scale, y * scale, z * scale
 
 
-@njit(**INLINE)
+@inlined
 def frame_of(nx, ny, nz):
     """Two unit vectors across a unit vector (Duff et al., Building an orthonormal basis, revisited)."""
     sign = 1.0 if nz >= 0.0 else -1.0
@@ -79,7 +78,7 @@ def frame_of(nx, ny, nz):
     return 1.0 + sign * nx * nx * a, sign * b, -sign * nx, b, sign + ny * ny * a, -ny
 
 
-@njit(**INLINE)
+@inlined
 def cosine_direction(state, nx, ny, nz):
     """Random direction about a normal, its density the cosine over pi."""
     r, phi = math.sqrt(uniform(state)), 2.0 * math.pi * uniform(state)
@@ -89,7 +88,7 @@ def cosine_direction(state, nx, ny, nz):
     return x * ax + y * bx + z * nx, x * ay + y * by + z * ny, x * az + y * bz + z * nz
 
 
-@njit(**INLINE)
+@inlined
 def any_direction(state):
     """Random direction, uniform over the sphere."""
     z, phi = 2.0 * uniform(state) - 1.0, 2.0 * math.pi * uniform(state)
@@ -97,14 +96,14 @@ def any_direction(state):
     return r * math.cos(phi), r * math.sin(phi), z
 
 
-@njit(**INLINE)
+@inlined
 def _smith(cosine, alpha2):
     """Smith's Lambda of GGX."""
     c2 = cosine * cosine
     return 0.5 * (math.sqrt(1.0 + alpha2 * (1.0 - c2) / max(c2, 1e-12)) - 1.0)
 
 
-@njit(**INLINE)
+@inlined
 def ggx(cos_o, cos_i, cos_h, o_dot_h, alpha, index):
     """GGX reflection (BRDF, per steradian) of a dielectric coat (Walter et al. 2007, height-correlated Smith)."""
     alpha2 = alpha * alpha
@@ -114,7 +113,7 @@ def ggx(cos_o, cos_i, cos_h, o_dot_h, alpha, index):
     return fresnel(o_dot_h, 1.0, index) * density * shadow / (4.0 * cos_o * cos_i)
 
 
-@njit(**INLINE)
+@inlined
 def ggx_towards(ox, oy, oz, ix, iy, iz, nx, ny, nz, alpha, index):
     """GGX reflection (BRDF, per steradian) between two directions on the normal's side."""
     hx, hy, hz = ox + ix, oy + iy, oz + iz
@@ -124,7 +123,7 @@ def ggx_towards(ox, oy, oz, ix, iy, iz, nx, ny, nz, alpha, index):
     return ggx(cos_o, cos_i, hx * nx + hy * ny + hz * nz, ox * hx + oy * hy + oz * hz, alpha, index)
 
 
-@njit(**COMPILE)
+@kernel
 def ggx_direction(state, ox, oy, oz, nx, ny, nz, alpha, index):
     """Random reflection off a GGX coat: direction, and its weight (BRDF times cosine over density); 0 is no direction.
 

@@ -7,12 +7,13 @@ on its left in (r, z); a lid closes it inside its cap. Profiles are segments: co
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 
 from tubepose.labware import CapModel, TubeModel, WallOptics
 from tubepose.simulation.scene import Label, Liquid, Material, PlacedTube, Scene
-from tubepose.simulation.structured_light.intersection import CAVITY, FLAT, LINE, OPAQUE, OUTSIDE, SPHERE
+from tubepose.simulation.structured_light.codes import CAVITY, FLAT, LINE, OPAQUE, OUTSIDE, SPHERE
 from tubepose.transforms import FloatArray, make_transform
 
 PROFILE_STEP_M = 1e-4
@@ -82,7 +83,7 @@ def scene_parts(scene: Scene) -> tuple[list[RevolvedPart], list[BoxPart]]:
 def segments_of(profile_zr_m: FloatArray) -> FloatArray:
     """Cones, cylinders and flat rings between the points of a profile (N, 2) of (z, r); the solid lies on its left."""
     rows = []
-    for (z0, r0), (z1, r1) in zip(profile_zr_m[:-1], profile_zr_m[1:], strict=True):
+    for (z0, r0), (z1, r1) in pairwise(profile_zr_m):
         length = float(np.hypot(z1 - z0, r1 - r0))
         if length < 1e-9:
             continue
@@ -202,13 +203,14 @@ def _radii_at(segments: FloatArray, z_m: FloatArray) -> FloatArray:
 
 
 def _profile(outer: FloatArray, cavity: FloatArray, top_m: float) -> FloatArray:
-    z = (np.arange(int(np.ceil(top_m / PROFILE_STEP_M))) + 0.5) * PROFILE_STEP_M
+    z = (np.arange(np.ceil(top_m / PROFILE_STEP_M), dtype=np.float64) + 0.5) * PROFILE_STEP_M
     return np.column_stack([_radii_at(outer, z), _radii_at(cavity, z)])
 
 
 def _cavity_at(cavity: FloatArray, level_m: float) -> FloatArray:
     """The cavity's wall about a height: z, radius and slope of a straight line."""
-    low, high = _radii_at(cavity, np.array([level_m - PROFILE_STEP_M, level_m + PROFILE_STEP_M]))
+    around: FloatArray = np.array([level_m - PROFILE_STEP_M, level_m + PROFILE_STEP_M])
+    low, high = _radii_at(cavity, around)
     return np.array([level_m, (low + high) / 2, (high - low) / (2 * PROFILE_STEP_M)])
 
 

@@ -2,8 +2,8 @@
 
 At each opaque surface that a path meets it adds the projector's light that arrives there straight through air, and the
 light that photons brought through plastic (`photons`). Then it goes on in a random direction: reflections between
-surfaces are of any order. In a wall it adds the wall's fluence along the way and goes on, weaker: what the wall scatters
-is all in the fluence. A path that leaves the scene meets the room's light.
+surfaces are of any order. In a wall it adds the wall's fluence along the way and goes on, weaker: what the wall
+scatters is all in the fluence. A path that leaves the scene meets the room's light.
 """
 
 from __future__ import annotations
@@ -11,10 +11,10 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
-from tubepose.simulation.structured_light.compiled import COMPILE
+from tubepose.simulation.structured_light.codes import NOTHING, REVOLVED
+from tubepose.simulation.structured_light.compiled import kernel
 from tubepose.simulation.structured_light.interfaces import (
     AIR,
     PLASTIC,
@@ -28,14 +28,7 @@ from tubepose.simulation.structured_light.interfaces import (
     material_of,
     next_hit,
 )
-from tubepose.simulation.structured_light.intersection import (
-    NOTHING,
-    REVOLVED,
-    blocked,
-    into,
-    normal_at,
-    turned_into,
-)
+from tubepose.simulation.structured_light.intersection import blocked, into, normal_at, turned_into
 from tubepose.simulation.structured_light.light_map import gather, locate, wall_depth, wall_patch
 from tubepose.simulation.structured_light.optics import (
     COAT_INDEX,
@@ -49,11 +42,11 @@ from tubepose.transforms import FloatArray
 MAX_EVENTS = 200
 FREE_BOUNCES = 0
 DIM, SURVIVAL = 0.05, 0.25
-# The room's light inside a wall, as a share of what it is in the open (an assumption): photons carry the projector's only.
+# The room's light inside a wall, as a share of what it is in the open (an assumption): photons carry none of it.
 ROOM_IN_WALLS = 0.6
 
 
-@njit(**COMPILE)
+@kernel
 def _add_direct(s, projector, x, y, z, nx, ny, nz, ox, oy, oz, diffuse, alpha, index, weight, sums, tags):
     """Add projector light that reaches a surface straight through air; `diffuse` is its BRDF's matte part.
 
@@ -76,7 +69,7 @@ def _add_direct(s, projector, x, y, z, nx, ny, nz, ox, oy, oz, diffuse, alpha, i
         sums[2 + i] += amplitude * tags[i]
 
 
-@njit(**COMPILE)
+@kernel
 def trace(s, m, projector, state, ox, oy, oz, dx, dy, dz, sums, tags):
     """Follow one camera path from a point in air and add what it collects to sums (8,).
 
@@ -85,8 +78,12 @@ def trace(s, m, projector, state, ox, oy, oz, dx, dy, dz, sums, tags):
         m: Its light map.
         projector: The light.
         state: Random numbers.
-        ox, oy, oz: Start of the path, rack frame.
-        dx, dy, dz: Unit direction.
+        ox: Start of the path, rack frame.
+        oy: See ox.
+        oz: See ox.
+        dx: Unit direction.
+        dy: See dx.
+        dz: See dx.
         sums: Projected light, room light, cosine and sine of each period.
         tags: Scratch, shape (6,).
     """
@@ -164,7 +161,7 @@ def trace(s, m, projector, state, ox, oy, oz, dx, dy, dz, sums, tags):
         ox, oy, oz = ox + START_OFF_M * nx, oy + START_OFF_M * ny, oz + START_OFF_M * nz
 
 
-@njit(**COMPILE)
+@kernel
 def _add_wall(s, m, state, inside, ox, oy, oz, dx, dy, dz, length, scattering, absorption, weight, sums):
     """Add projector light that a wall scatters into the path once: the fluence at one random point of the way."""
     along = uniform(state) * length
@@ -183,7 +180,7 @@ def scratch() -> tuple[NDArray[np.uint64], FloatArray, FloatArray]:
     return np.empty(1, dtype=np.uint64), np.empty(6), np.empty(8)
 
 
-@njit(**COMPILE)
+@kernel
 def radiance(s, m, projector, origins, directions, samples, seed, sums, squares, state, tags, one):
     """Add `samples` paths along each of N rays to sums (N, 8); squares (N,) get the middle period's squared length.
 
@@ -202,7 +199,7 @@ def radiance(s, m, projector, origins, directions, samples, seed, sums, squares,
             squares[i] += one[4] * one[4] + one[5] * one[5]
 
 
-@njit(**COMPILE)
+@kernel
 def expose_pixels(s, m, projector, lens, rotation, pixels, width, side, first, seed, sums, squares, state, tags, one):
     """Add side * side paths, one in each cell of a square grid over the pixel, to the sums of pixels.
 
@@ -219,7 +216,9 @@ def expose_pixels(s, m, projector, lens, rotation, pixels, width, side, first, s
         seed: Of the random numbers.
         sums: Shape (pixels of the image, 8).
         squares: Squared length of the middle period's phasors, shape (pixels of the image,).
-        state, tags, one: Scratch, from `scratch`.
+        state: Scratch, as the two below: from `scratch`.
+        tags: Scratch.
+        one: Scratch.
     """
     for pixel in pixels:
         for k in range(side * side):

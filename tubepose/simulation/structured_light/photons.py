@@ -14,10 +14,10 @@ import math
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
-from tubepose.simulation.structured_light.compiled import COMPILE
+from tubepose.simulation.structured_light.codes import NOTHING
+from tubepose.simulation.structured_light.compiled import kernel
 from tubepose.simulation.structured_light.interfaces import (
     AIR,
     PLASTIC,
@@ -29,7 +29,7 @@ from tubepose.simulation.structured_light.interfaces import (
     material_of,
     next_hit,
 )
-from tubepose.simulation.structured_light.intersection import NOTHING, closest, into, normal_at, turned_into
+from tubepose.simulation.structured_light.intersection import closest, into, normal_at, turned_into
 from tubepose.simulation.structured_light.light_map import LightMap, locate, texel, wall_depth, wall_patch
 from tubepose.simulation.structured_light.optics import any_direction, start, uniform
 from tubepose.simulation.structured_light.projector import Projector, tagged
@@ -109,7 +109,7 @@ def light_through_plastic(
         m.light[:, :7] += other.light[:, :7]
 
 
-@njit(**COMPILE)
+@kernel
 def _emitted(projector, state, rectangle, step_x, step_y, column, row):
     """Tangent x, direction and power of a photon from a jittered cell of a rectangle of tangents."""
     tx = rectangle[0] + (column + uniform(state)) * step_x
@@ -123,7 +123,7 @@ def _emitted(projector, state, rectangle, step_x, step_y, column, row):
     return tx, dx, dy, dz, power
 
 
-@njit(**COMPILE)
+@kernel
 def _follow(s, m, projector, rectangle, columns, rows, body, seed, strand, state, tags):
     """Follow every `STRANDS`-th photon of a jittered grid of tangents; two arrays are scratch.
 
@@ -149,7 +149,7 @@ def _follow(s, m, projector, rectangle, columns, rows, body, seed, strand, state
             _fly(s, m, state, x, y, z, dx, dy, dz, code, index, owner, power, tags)
 
 
-@njit(**COMPILE)
+@kernel
 def _fly(s, m, state, x, y, z, dx, dy, dz, code, index, owner, full_power, tags):
     """Follow a photon, unscattered, from its first interface to the opaque surface where it ends."""
     power = full_power
@@ -185,7 +185,7 @@ def _fly(s, m, state, x, y, z, dx, dy, dz, code, index, owner, full_power, tags)
             power /= SURVIVAL
 
 
-@njit(**COMPILE)
+@kernel
 def _bounce(s, m, state, medium, inside, x, y, z, dx, dy, dz, code, index, owner, power, share, tags):
     """Send a share of the photons that a surface scatters on as walkers of accordingly more power."""
     if uniform(state) >= share:
@@ -200,7 +200,7 @@ def _bounce(s, m, state, medium, inside, x, y, z, dx, dy, dz, code, index, owner
         _walk(s, m, state, medium, inside, x, y, z, dx, dy, dz, power * weight / share, tags)
 
 
-@njit(**COMPILE)
+@kernel
 def _walk(s, m, state, medium, inside, x, y, z, dx, dy, dz, power, tags):
     """Follow scattered light until it leaves the scene or is absorbed; it adds to the walls that it crosses."""
     least = LEAST_SHARE * power
@@ -239,7 +239,7 @@ def _walk(s, m, state, medium, inside, x, y, z, dx, dy, dz, power, tags):
             power /= SURVIVAL
 
 
-@njit(**COMPILE)
+@kernel
 def _leave_track(s, m, state, inside, x, y, z, dx, dy, dz, length, extinction, power, tags):
     """Add power times track length to the texels of a wall, at random points of the track's equal parts."""
     ox, oy, oz = into(s, inside, x, y, z)
@@ -254,7 +254,7 @@ def _leave_track(s, m, state, inside, x, y, z, dx, dy, dz, length, extinction, p
         _add(m, texel(m, patch, math.atan2(qy, qx), qz, depth), power * part * math.exp(-extinction * along), tags)
 
 
-@njit(**COMPILE)
+@kernel
 def _add(m, place, power, tags):
     if place < 0:
         return

@@ -6,10 +6,9 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
 from tubepose.simulation.camera import PERIODS, StructuredLightCamera
-from tubepose.simulation.structured_light.compiled import INLINE
+from tubepose.simulation.structured_light.compiled import inlined
 from tubepose.transforms import FloatArray, invert_transform
 
 assert PERIODS == (1024.0, 128.0, 16.0), "tagged() takes each period for an eighth of the one before"
@@ -41,7 +40,7 @@ def projector_of(camera: StructuredLightCamera, T_camera_rack: FloatArray) -> Pr
     return Projector(position, np.ascontiguousarray(axes), np.array(numbers))
 
 
-@njit(**INLINE)
+@inlined
 def tagged(column, tags):
     """Fill tags (6,) with the cosine and sine of a column's phase in the three periods."""
     c, s = math.cos(2.0 * math.pi / 1024.0 * column), math.sin(2.0 * math.pi / 1024.0 * column)
@@ -52,7 +51,7 @@ def tagged(column, tags):
                 c, s = c * c - s * s, 2.0 * c * s
 
 
-@njit(**INLINE)
+@inlined
 def towards(projector, x, y, z):
     """Direction and distance to the projector, and the column that lights a point; -1 outside the projector's field."""
     px, py, pz = projector.position_m[0], projector.position_m[1], projector.position_m[2]

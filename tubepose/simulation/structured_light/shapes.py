@@ -106,7 +106,7 @@ def make_shapes(
     bounds = [_bounds_of(part) for part in revolved] + [_box_bounds(part) for part in boxes]
     segment_counts = [sum(len(piece.segments) for piece in part.pieces) for part in revolved]
     pieces = [piece for part in revolved for piece in part.pieces]
-    grid = _make_grid(slots, bounds)
+    grid, cells, slot_start, slot_list, item_start, item_list, item_bounds = _make_grid(slots, bounds)
     profiles = [np.empty((0, 2)) if part.profile_m is None else part.profile_m for part in revolved]
     material_of = [number(piece.material) for piece in pieces]
     box_material = [number(part.material) for part in boxes]
@@ -114,7 +114,13 @@ def make_shapes(
         table=np.array([table_half_m]),
         rack=np.zeros(4) if rack_model is None else _rack(rack_model),
         slots=slots,
-        **grid,
+        grid=grid,
+        cells=cells,
+        slot_start=slot_start,
+        slot_list=slot_list,
+        item_start=item_start,
+        item_list=item_list,
+        item_bounds=item_bounds,
         solids=np.array([_solid(part) for part in revolved]).reshape(-1, 28),
         segment_start=np.concatenate([[0], np.cumsum(segment_counts)]).astype(np.int64),
         segments=np.concatenate([np.empty((0, 11)), *(piece.segments for piece in pieces)]),
@@ -199,7 +205,7 @@ class _Cells:
     """Square cells over x and y."""
 
     origin: FloatArray
-    size: FloatArray
+    size: IntArray
 
     def lists(self, bounds: Sequence[FloatArray]) -> tuple[IntArray, IntArray]:
         """Rows of `bounds` (each (2 or 3, 2)) that reach into each cell: starts and members."""
@@ -215,24 +221,17 @@ class _Cells:
         return starts.astype(np.int64), np.array([i for m in members for i in m], dtype=np.int64)
 
 
-def _make_grid(slots: FloatArray, items: Sequence[FloatArray]) -> dict[str, NDArray[np.float64] | IntArray]:
+def _make_grid(
+    slots: FloatArray, items: Sequence[FloatArray]
+) -> tuple[FloatArray, IntArray, IntArray, IntArray, IntArray, IntArray, FloatArray]:
+    """Fields `grid` to `item_bounds` of `Shapes`, in order."""
     openings = [np.column_stack([row[:2] - row[2:4], row[:2] + row[2:4]]) for row in slots]
     everything = [bound[:2] for bound in (*openings, *items)] or [np.zeros((2, 2))]
     low = np.min([bound[:, 0] for bound in everything], axis=0) - _MARGIN_M
     high = np.max([bound[:, 1] for bound in everything], axis=0) + _MARGIN_M
     cells = _Cells(low, np.floor((high - low) / _CELL_M).astype(np.int64) + 1)
-    slot_start, slot_list = cells.lists(openings)
-    item_start, item_list = cells.lists(items)
     # Without items the bounds are empty: no ray enters them.
     bounds = np.array([[1.0, 0.0]] * 3)
     if items:
         bounds = np.column_stack([np.min([b[:, 0] for b in items], axis=0), np.max([b[:, 1] for b in items], axis=0)])
-    return {
-        "grid": np.array([*low, _CELL_M]),
-        "cells": cells.size,
-        "slot_start": slot_start,
-        "slot_list": slot_list,
-        "item_start": item_start,
-        "item_list": item_list,
-        "item_bounds": bounds,
-    }
+    return np.array([*low, _CELL_M]), cells.size, *cells.lists(openings), *cells.lists(items), bounds
