@@ -7,6 +7,7 @@ import pytest
 import scenes
 from scipy.spatial.transform import Rotation
 
+import tubepose.rack as rack_module
 from tubepose.capture.session import SlotHint
 from tubepose.config import Config, RackConfig
 from tubepose.labware import load_rack, load_tube
@@ -296,3 +297,20 @@ def test_the_template_lies_on_the_solid_top_and_nowhere_else():
     solid = np.prod(MIXED.outline_mm) - sum(np.pi * (s.size_mm[0] / 2) ** 2 for s in MIXED.all_slots)
     assert len(template) == pytest.approx(solid, rel=0.01)  # one point per square millimetre
     assert not np.any(np.hypot(*(template[:, :2] - MIXED.slot("B4").center_m).T) < 15e-3)
+
+
+def test_a_bounding_box_that_stands_askew_does_not_lose_the_rack(soft_scan, monkeypatch):
+    hypotheses = rack_module._hypotheses
+    askew = make_transform(Rotation.from_euler("x", 25, degrees=True).as_matrix(), np.zeros(3))
+    starts = []
+
+    def turned(*arguments):
+        starts.extend(T @ askew for T in hypotheses(*arguments))
+        return starts
+
+    monkeypatch.setattr(rack_module, "_hypotheses", turned)
+    pose = register_rack(soft_scan, SOFT, CONFIG)
+    assert len(starts) > 0
+    assert pose.status is RackStatus.OK
+    assert pose.fitness > 0.95
+    assert_same_pose(turned_to_match(pose.T_camera_rack, T_CAMERA_SOFT), T_CAMERA_SOFT)
