@@ -19,7 +19,9 @@ from tubepose.transforms import FloatArray, axis_rotation, invert_transform, mak
 from tubepose.tube import TubePose, TubeStatus
 
 registration = o3d.pipelines.registration
+Feature = o3d.pipelines.registration.Feature
 RIM_VIEW_M = 0.012
+MIN_FEATURES = 10
 
 
 def fit_upright(
@@ -38,8 +40,8 @@ def fit_slot_icp(
     del seed
     start = make_transform(np.eye(3), rack.bottom_center_m(slot))
     if len(points_m) < 3:
-        return _failed("fewer than 3 points", points_m)
-    return _refine(points_m, start, _template(tube, rack.depth_m, config.icp.template_points), config.icp)
+        return failed("fewer than 3 points", points_m)
+    return refine(points_m, start, visible_template(tube, rack.depth_m, config.icp.template_points), config.icp)
 
 
 def fit_global_icp(
@@ -47,16 +49,11 @@ def fit_global_icp(
 ) -> TubePose:
     """Global registration (FPFH features, RANSAC) + ICP, without any prior from the rack."""
     del slot
-    template = _template(tube, rack.depth_m, config.icp.template_points)
-    target, target_features = _features(template, config.icp)
-    scan = to_o3d(points_m).voxel_down_sample(config.icp.voxel_m)
-    if len(scan.points) < 10:
-        return _failed(f"{len(scan.points)} points after down-sampling, at least 10 expected", points_m)
-    # Orient normals as the camera saw them: the rack's z points towards it.
-    scan.estimate_normals(o3d.geometry.KDTreeSearchParamHybrid(config.icp.normal_radius_m, 30))
-    scan.orient_normals_towards_camera_location(np.array([0.0, 0.0, 1.0]))
-    radius = o3d.geometry.KDTreeSearchParamHybrid(config.icp.feature_radius_m, 100)
-    features = registration.compute_fpfh_feature(scan, radius)  # type: ignore[call-arg]  # stub lacks a default
+    template = visible_template(tube, rack.depth_m, config.icp.template_points)
+    target, target_features = template_features(template, config.icp)
+    scan, features = scan_features(points_m, config.icp)
+    if len(scan.points) < MIN_FEATURES:
+        return failed(f"{len(scan.points)} points after down-sampling, at least {MIN_FEATURES} expected", points_m)
     o3d.utility.random.seed(seed)
     found = registration.registration_ransac_based_on_feature_matching(
         scan,
@@ -76,18 +73,26 @@ def fit_global_icp(
         registration.RANSACConvergenceCriteria(config.icp.ransac_iterations, config.icp.ransac_confidence),
     )
     if found.fitness == 0.0:
-        return _failed("global registration found no correspondence", points_m)
-    return _refine(points_m, invert_transform(found.transformation), template, config.icp)
+        return failed("global registration found no correspondence", points_m)
+    return refine(points_m, invert_transform(found.transformation), template, config.icp)
 
 
-def _failed(reason: str, points_m: FloatArray) -> TubePose:
+def failed(reason: str, points_m: FloatArray) -> TubePose:
+    """No pose, and why."""
     return TubePose(TubeStatus.FAILED, reason, n_points=len(points_m))
 
 
-def _refine(
+def refine(
     points_m: FloatArray, T_rack_tube: FloatArray, template: o3d.geometry.PointCloud, config: IcpConfig
 ) -> TubePose:
-    """ICP rounds, coarse to fine, of the scan onto the template."""
+    """ICP rounds, coarse to fine, of the scan onto the template; the spin is fixed by the rule of Eq. 1.
+
+    Args:
+        points_m: Scan, rack frame, shape (N, 3), metres.
+        T_rack_tube: Start, shape (4, 4), metres.
+        template: Points with normals in the tube's frame, metres.
+        config: Distances, iterations and the kind of estimation.
+    """
     method = (
         registration.TransformationEstimationPointToPlane()
         if config.estimation == "point_to_plane"
@@ -101,7 +106,7 @@ def _refine(
         result = registration.registration_icp(scan, template, distance_m, T_tube_rack, method, criteria)
         # Open3D returns its start, fitness 0 and rmse 0.0 when nothing corresponds.
         if result.fitness == 0.0:
-            return _failed(f"ICP found no correspondence within {distance_m * 1e3:.1f} mm", points_m)
+            return failed(f"ICP found no correspondence within {distance_m * 1e3:.1f} mm", points_m)
         T_tube_rack, fitness, rmse = result.transformation, float(result.fitness), float(result.inlier_rmse)
     T = invert_transform(T_tube_rack)
     T_fixed_spin = make_transform(axis_rotation(T[:3, 2]), T[:3, 3])
@@ -109,10 +114,18 @@ def _refine(
 
 
 @lru_cache(maxsize=32)
-def _template(tube: TubeModel, hidden_m: float, count: int) -> o3d.geometry.PointCloud:
+def visible_template(tube: TubeModel, hidden_m: float, count: int) -> o3d.geometry.PointCloud:
     """Points with outward normals on what a scanner above sees of a tube whose lower part is hidden by the rack.
 
     The profile is sampled by area, evenly in angle (golden angle): no randomness.
+
+    Args:
+        tube: The tube's model.
+        hidden_m: Height above the tube's bottom up to which the rack hides it, metres.
+        count: Number of points.
+
+    Returns:
+        Cloud in the tube's frame, metres. It is shared: do not change it.
     """
     pieces = [_visible(tube.outer_profile_m(), hidden_m)]
     if tube.is_open:
@@ -145,11 +158,24 @@ def _visible(profile_m: FloatArray, above_m: float) -> FloatArray:
 
 
 @lru_cache(maxsize=32)
-def _features(
-    template: o3d.geometry.PointCloud, config: IcpConfig
-) -> tuple[o3d.geometry.PointCloud, o3d.pipelines.registration.Feature]:
-    """Down-sampled template and its FPFH features, made once per tube."""
+def template_features(template: o3d.geometry.PointCloud, config: IcpConfig) -> tuple[o3d.geometry.PointCloud, Feature]:
+    """Down-sampled template with unit normals (tube frame, metres) and its FPFH features, made once per tube."""
     target = template.voxel_down_sample(config.voxel_m)
     target.normalize_normals()
+    return target, _fpfh(target, config)
+
+
+def scan_features(points_m: FloatArray, config: IcpConfig) -> tuple[o3d.geometry.PointCloud, Feature]:
+    """The scan (N, 3), rack frame, metres, down-sampled, with normals as the camera saw them, and its FPFH features."""
+    scan = to_o3d(points_m).voxel_down_sample(config.voxel_m)
+    if len(scan.points) < MIN_FEATURES:
+        return scan, registration.Feature()
+    # Orient normals as the camera saw them: the rack's z points towards it.
+    scan.estimate_normals(o3d.geometry.KDTreeSearchParamHybrid(config.normal_radius_m, 30))
+    scan.orient_normals_towards_camera_location(np.array([0.0, 0.0, 1.0]))
+    return scan, _fpfh(scan, config)
+
+
+def _fpfh(cloud: o3d.geometry.PointCloud, config: IcpConfig) -> Feature:
     radius = o3d.geometry.KDTreeSearchParamHybrid(config.feature_radius_m, 100)
-    return target, registration.compute_fpfh_feature(target, radius)  # type: ignore[call-arg]  # as above
+    return registration.compute_fpfh_feature(cloud, radius)  # type: ignore[call-arg]  # stub lacks a default
