@@ -9,12 +9,13 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Literal
 
-from pydantic import BaseModel, ConfigDict
+from pydantic import BaseModel, ConfigDict, Field
 
 from tubepose.errors import ConfigError
 from tubepose.labware.reading import read_yaml, validate
 
 Objective = Literal["hinge", "signed", "l1", "l2", "count"]
+RackMethod = Literal["edges", "obb-icp"]
 
 
 class _Section(BaseModel):
@@ -47,10 +48,12 @@ class RackTopConfig(_Section):
         plane_iterations: RANSAC iterations.
         max_planes: How many dominant planes are tried as "level".
         bin_m: Bin of the height histogram.
+        max_bands: How many of its peaks are tried, the fullest first (method ``edges``).
         band_m: Half thickness of the band about a histogram peak.
         outline_tolerance_m: Allowed difference of the measured and the defined outline, per side.
         max_in_slot_share: Largest share of the band in the openings; the slots' floor has nearly all of it there.
         search_points: Points of the cloud that the search sees, evenly thinned.
+        coarse_points: The same for method ``edges``; of a cloud of more than three times as many, a third.
         seed: Seed of the RANSAC.
     """
 
@@ -58,10 +61,12 @@ class RackTopConfig(_Section):
     plane_iterations: int = 300
     max_planes: int = 3
     bin_m: float = 5.0e-4
+    max_bands: int = 8
     band_m: float = 2.0e-3
     outline_tolerance_m: float = 5.0e-3
     max_in_slot_share: float = 0.3
     search_points: int = 100_000
+    coarse_points: int = 30_000
     seed: int = 0
 
 
@@ -69,6 +74,9 @@ class RackConfig(_Section):
     """Registration of the rack (paper, section IV-A).
 
     Attributes:
+        method: ``edges``: plane and edges of the top's ribs, openings and outline; ``obb-icp``: the paper's way, oriented
+            bounding box and ICP. The fields from template_spacing_m to coarse_points, min_fitness and min_coverage are
+            the latter's alone.
         template_spacing_m: Grid of the template of the top surface.
         icp_distances_m: Correspondence distance of each ICP round, coarse to fine.
         icp_iterations: Iterations per round.
@@ -80,9 +88,16 @@ class RackConfig(_Section):
         max_in_slot_share: Largest share of such points: fitness alone accepts a rack of another pitch.
         min_coverage: Smallest share of the template that is seen.
         ambiguous_margin_m: Two turns whose rmse differ by less are not told apart by geometry.
+        edge_margin_m: The same as slot_margin_m for method ``edges``, which looks at a thinner layer.
+        min_seen: Smallest share of the template that is seen, for method ``edges``: a rack full of caps shows little.
+        clear_seen: With this share seen, an accepted pose is not compared with all others that the search can find.
+        max_through_share: Largest share of what is seen in place of ribs that lies below them.
+        min_slot_margin: Smallest evidence, in nats, against the rack standing a slot farther.
+        min_rival_ratio: Smallest ratio of the evidence of a pose to that of the next one that is accepted too.
         max_spacing_ratio: Largest point spacing, in units of the rack's narrowest rib; coarser is insufficient.
     """
 
+    method: RackMethod = "edges"
     template_spacing_m: float = 5.0e-4
     icp_distances_m: tuple[float, ...] = (6.0e-3, 3.0e-3, 1.2e-3)
     icp_iterations: int = 60
@@ -94,6 +109,12 @@ class RackConfig(_Section):
     max_in_slot_share: float = 0.06
     min_coverage: float = 0.25
     ambiguous_margin_m: float = 5.0e-5
+    edge_margin_m: float = 1.0e-3
+    min_seen: float = 0.05
+    clear_seen: float = 0.25
+    max_through_share: float = 0.5
+    min_slot_margin: float = 10.0
+    min_rival_ratio: float = 1.5
     max_spacing_ratio: float = 1.0
 
 
@@ -162,6 +183,46 @@ class IcpConfig(_Section):
     ransac_confidence: float = 0.999
 
 
+class RivalsConfig(_Section):
+    """The rivals of the extra ``rivals``: KISS-Matcher and small_gicp; settings printed with the tables.
+
+    Attributes:
+        kiss_voxel_m: Voxel of the features.
+        kiss_normal_radius_m: Radius of the normals.
+        kiss_feature_radius_m: Radius of the FPFH features.
+        kiss_neighbors: How many of the template's features each scan feature is paired with.
+        kiss_pairs: Pairs that one attempt sees, drawn by the seed.
+        kiss_noise_bound_m: Noise bound of the pruning by pairwise distances; the solver's is `kiss_solver_gain` of it.
+        kiss_solver_gain: At most 1.
+        kiss_pruning: Prune the pairs by k-core before they are solved.
+        kiss_attempts: Draws of pairs; the best by agreement of points and normals is kept.
+        kiss_agree_m: A point this near to the template, with a normal within 30 degrees, agrees.
+        kiss_refinement: ``icp``, as the other rivals, or ``gicp``.
+        gicp_kind: Registration of small_gicp.
+        gicp_target: ``template``: scan onto template; ``scan``: template onto scan.
+        gicp_max_distance_m: Correspondence distances of the rounds, coarse to fine.
+        gicp_neighbors: Neighbours of a point's covariance.
+        gicp_iterations: Iterations per round.
+    """
+
+    kiss_voxel_m: float = Field(default=1.0e-3, gt=0)
+    kiss_normal_radius_m: float = Field(default=3.0e-3, gt=0)
+    kiss_feature_radius_m: float = Field(default=6.0e-3, gt=0)
+    kiss_neighbors: int = Field(default=5, ge=1)
+    kiss_pairs: int = Field(default=400, ge=3)
+    kiss_noise_bound_m: float = Field(default=2.0e-3, gt=0)
+    kiss_solver_gain: float = Field(default=0.75, gt=0, le=1)
+    kiss_pruning: bool = True
+    kiss_attempts: int = Field(default=20, ge=1)
+    kiss_agree_m: float = Field(default=1.5e-3, gt=0)
+    kiss_refinement: Literal["icp", "gicp"] = "icp"
+    gicp_kind: Literal["GICP", "PLANE_ICP", "ICP"] = "GICP"
+    gicp_target: Literal["template", "scan"] = "template"
+    gicp_max_distance_m: tuple[float, ...] = Field(default=(2.0e-3, 1.0e-3), min_length=1)
+    gicp_neighbors: int = Field(default=10, ge=5)
+    gicp_iterations: int = Field(default=50, ge=1)
+
+
 class Config(_Section):
     """All sections."""
 
@@ -171,6 +232,7 @@ class Config(_Section):
     slots: SlotConfig = SlotConfig()
     tube: TubeConfig = TubeConfig()
     icp: IcpConfig = IcpConfig()
+    rivals: RivalsConfig = RivalsConfig()
 
 
 def load_config(path: Path | None) -> Config:

@@ -1,97 +1,30 @@
-"""Pose of the rack: OBB start with every hypothesis, ICP on the template of the top surface (paper, section IV-A).
+"""Pose of the rack (paper, section IV-A): by the edges of its ribs, or by the paper's OBB and ICP.
 
-A scan of a rack's top cannot always tell which way round the rack stands, and ICP's fitness cannot tell a rack from one
-of another pitch: both are measured here, reported, and decide about the status.
+Either way a registration that contradicts the rack's definition is refused, and what a capture cannot show is told
+apart from a wrong rack.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-from enum import StrEnum
-from functools import lru_cache
-from itertools import permutations, product
-
-import numpy as np
-import open3d as o3d
+from collections.abc import Callable
+from dataclasses import replace
 
 from tubepose.capture.frame import CameraIntrinsics
 from tubepose.capture.session import SlotHint
-from tubepose.config import Config, RackConfig
+from tubepose.config import Config
 from tubepose.labware import RackModel
-from tubepose.preprocessing import (
-    RackTop,
-    find_rack_top,
-    level_noise_m,
-    plausible_unit_factors,
-    point_spacing_m,
-    remove_outliers,
-    thin,
-    to_o3d,
-    voxel_downsample,
-)
-from tubepose.rack_acceptance import agreement, refusal, too_coarse, too_noisy
-from tubepose.transforms import HALF_TURN, FloatArray, invert_transform, make_transform, transform_points
+from tubepose.preprocessing import level_noise_m, plausible_unit_factors
+from tubepose.rack_acceptance import outline_words, too_noisy
+from tubepose.rack_edges import register_edges
+from tubepose.rack_obb import rack_template_m, register_obb_icp
+from tubepose.rack_pose import MIN_POINTS, RackPose, RackStatus
+from tubepose.transforms import FloatArray
 
-MIN_POINTS = 50
-
-
-class RackStatus(StrEnum):
-    """What became of a rack."""
-
-    OK = "ok"
-    NOT_FOUND = "not_found"
-    INSUFFICIENT = "insufficient"
-    REFUSED = "refused"
-    UNIT = "wrong_unit"
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class RackPose:
-    """Pose of a rack in the camera frame.
-
-    Attributes:
-        status: OK, or the kind of failure.
-        reason: In words, empty when OK.
-        T_camera_rack: Array of shape (4, 4); maps rack points to camera points, metres. None unless status is OK.
-        inlier_rmse_m: RMS distance of the ICP inliers, metres; NaN without a registration.
-        fitness: Share of the top's points with a correspondence; NaN without a registration.
-        in_slot_share: Share of the top's points that lie inside the template's openings; NaN without a registration.
-        coverage: Share of the template that the scan covers; NaN without a registration.
-        ambiguous: True when neither geometry nor a hint tells the rack from itself turned by 180 degrees.
-        resolved_by: ``geometry``, ``hint``, or ``rule`` (rack x points to the bottom right of the image), or ``given``;
-            empty without a pose.
-        turn_margin_m: Inlier rmse of the other turn minus that of this one, metres; NaN without a registration.
-        spacing_m: Median point spacing of the top, metres; NaN without points.
-    """
-
-    status: RackStatus
-    reason: str = ""
-    T_camera_rack: FloatArray | None = None
-    inlier_rmse_m: float = float("nan")
-    fitness: float = float("nan")
-    in_slot_share: float = float("nan")
-    coverage: float = float("nan")
-    ambiguous: bool = False
-    resolved_by: str = ""
-    turn_margin_m: float = float("nan")
-    spacing_m: float = float("nan")
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Registration:
-    T_camera_rack: FloatArray
-    fitness: float
-    inlier_rmse_m: float
-
-
-@lru_cache(maxsize=16)
-def rack_template_m(rack: RackModel, spacing_m: float) -> FloatArray:
-    """Template of the top surface: a grid on the solid part of the top, rack frame, shape (N, 3), metres."""
-    half = rack.outline_m / 2
-    axes = [np.arange(-h + spacing_m / 2, h, spacing_m) for h in half]
-    xy = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 2)
-    xy = xy[rack.top_signed_distance_m(xy) <= 0]
-    return np.column_stack([xy, np.full(len(xy), rack.height_m)])
+_Method = Callable[
+    [FloatArray, RackModel, Config, SlotHint | None, CameraIntrinsics | None],
+    RackPose,
+]
+_METHODS: dict[str, _Method] = {"edges": register_edges, "obb-icp": register_obb_icp}
 
 
 def register_rack(
@@ -104,17 +37,19 @@ def register_rack(
     """Estimate a rack's pose from the points that a detector gave it.
 
     Args:
-        points_m: Array of shape (N, 3), camera frame, metres, without NaN: the rack's box, with whatever stands in it.
+        points_m: Array of shape (N, 3), camera frame, metres, without NaN: the rack's box, with whatever stands in it,
+            or the whole frame.
         rack: The rack's definition.
-        config: Sections preprocess, rack_top and rack are used.
+        config: Sections preprocess, rack_top and rack are used; `rack.method` names the method.
         hint: Where a slot is seen in the image, to tell the two turns apart.
         intrinsics: Of that image; without them the hint is not used.
     """
-    pose = _register(points_m, rack, config, hint, intrinsics)
+    method = _METHODS[config.rack.method]
+    pose = method(points_m, rack, config, hint, intrinsics)
     if pose.status is RackStatus.OK or len(points_m) < MIN_POINTS:
         return pose
     # Asked of a too coarse scan as well: millimetres read as metres are one.
-    reason = _unit_suspicion(points_m, rack, config)
+    reason = _unit_suspicion(points_m, rack, config, method)
     if reason:
         return replace(pose, status=RackStatus.UNIT, reason=reason)
     if pose.status is not RackStatus.INSUFFICIENT:
@@ -124,157 +59,16 @@ def register_rack(
     return pose
 
 
-def _register(
-    points_m: FloatArray, rack: RackModel, config: Config, hint: SlotHint | None, intrinsics: CameraIntrinsics | None
-) -> RackPose:
-    if len(points_m) < MIN_POINTS:
-        reason = f"{len(points_m)} valid points on the rack, expected at least {MIN_POINTS}"
-        return RackPose(RackStatus.INSUFFICIENT, reason)
-    top = find_rack_top(points_m, rack, config.rack_top)
-    if top is None or not top.fits(config.rack_top):
-        return _not_found(points_m, top, rack, config.rack)
-    band = points_m[top.band_rows]
-    spacing_m = point_spacing_m(band)
-    coarse = too_coarse(spacing_m, rack, config.rack)
-    if coarse:
-        return RackPose(RackStatus.INSUFFICIENT, coarse, spacing_m=spacing_m)
-    scan = remove_outliers(voxel_downsample(band, config.preprocess.rack_voxel_m), config.preprocess)
-    best, turned = _register_all(scan, top, rack, config.rack)
-    margin_m = turned.inlier_rmse_m - best.inlier_rmse_m
-    chosen, resolved_by = _choose_turn(best, turned, rack, config.rack, hint, intrinsics)
-    template_m = rack_template_m(rack, config.rack.template_spacing_m)
-    in_slot, coverage = agreement(scan, chosen.T_camera_rack, template_m, rack, config.rack)
-    reason = refusal(chosen.fitness, chosen.inlier_rmse_m, in_slot, coverage, rack, config.rack)
-    return RackPose(
-        RackStatus.REFUSED if reason else RackStatus.OK,
-        reason,
-        None if reason else chosen.T_camera_rack,
-        chosen.inlier_rmse_m,
-        chosen.fitness,
-        in_slot,
-        coverage,
-        ambiguous=resolved_by == "rule" and not reason,
-        resolved_by="" if reason else resolved_by,
-        turn_margin_m=margin_m if chosen is best else -margin_m,
-        spacing_m=spacing_m,
-    )
-
-
-def _not_found(points_m: FloatArray, top: RackTop | None, rack: RackModel, config: RackConfig) -> RackPose:
-    spacing_m = point_spacing_m(points_m)
-    coarse = too_coarse(spacing_m, rack, config)
-    if coarse:
-        return RackPose(RackStatus.INSUFFICIENT, coarse, spacing_m=spacing_m)
-    found = "no level band" if top is None else f"a band of {top.size_m[0] * 1e3:.1f} x {top.size_m[1] * 1e3:.1f} mm"
-    return RackPose(
-        RackStatus.NOT_FOUND,
-        f"no top of {rack.name} ({_outline_mm(rack)} mm) among the points; closest: {found}",
-        spacing_m=spacing_m,
-    )
-
-
-def _unit_suspicion(points_m: FloatArray, rack: RackModel, config: Config) -> str:
+def _unit_suspicion(points_m: FloatArray, rack: RackModel, config: Config, method: _Method) -> str:
     """A sentence when the rack is there at another scale, accepted by every test that a pose has to pass."""
     for factor in plausible_unit_factors(points_m, rack):
-        if _register(points_m / factor, rack, config, None, None).status is RackStatus.OK:
+        if method(points_m / factor, rack, config, None, None).status is RackStatus.OK:
             size = f"{factor:g} times larger" if factor > 1 else f"{1 / factor:g} times smaller"
             return (
-                f"a rack of this shape is there, but {size} than {rack.name} ({_outline_mm(rack)} mm): "
+                f"a rack of this shape is there, but {size} than {rack.name} ({outline_words(rack)} mm): "
                 "is the unit of the capture declared right (m or mm)?"
             )
     return ""
 
 
-def _outline_mm(rack: RackModel) -> str:
-    return " x ".join(f"{side:g}" for side in rack.outline_mm)
-
-
-def _hypotheses(top: RackTop, band_m: FloatArray, rack: RackModel) -> list[FloatArray]:
-    """Every right-handed assignment of the OBB's axes to the rack's with z up, as T_camera_rack.
-
-    Open3D gives the box's axes in any order and sign. Assignments that swap clearly different sides are left out.
-    """
-    box = to_o3d(band_m).get_minimal_oriented_bounding_box()
-    up = top.T_camera_top[:3, 2]
-    found = []
-    if not np.allclose(box.R.T @ box.R, np.eye(3), atol=1e-6):
-        # Open3D warns of such a box and returns it all the same.
-        box = to_o3d(band_m).get_oriented_bounding_box()
-    for order in permutations(range(3)):
-        sides_m = box.extent[list(order[:2])]
-        if np.max(np.abs(sides_m - rack.outline_m) / rack.outline_m) > 0.25:
-            continue
-        for signs in product((1.0, -1.0), repeat=3):
-            R = box.R[:, order] * np.array(signs)
-            if np.linalg.det(R) > 0 and R[:, 2] @ up > np.cos(np.deg2rad(30)):
-                found.append(make_transform(R, box.center - rack.height_m * R[:, 2]))
-    return found
-
-
-def _register_all(
-    scan_m: FloatArray, top: RackTop, rack: RackModel, config: RackConfig
-) -> tuple[_Registration, _Registration]:
-    """Best registration over all hypotheses, and the same turned by 180 degrees and refined."""
-    template_m = rack_template_m(rack, config.template_spacing_m)
-    target = to_o3d(template_m)
-    source = to_o3d(scan_m)
-    few = to_o3d(thin(scan_m, config.coarse_points))
-    corners = np.array([[x, y, 0.0] for x in (-0.5, 0.5) for y in (-0.5, 0.5)]) * [*top.size_m, 0.0]
-    outline_m = np.vstack([scan_m, transform_points(top.T_camera_top, corners)])
-    starts = _hypotheses(top, outline_m, rack)
-    coarse = [_icp(few, target, start, config, config.icp_distances_m[:1]) for start in starts]
-    if max((r.fitness for r in coarse), default=0.0) < config.min_fitness:
-        # Few points above or below the band can turn the whole box; the band's own rectangle does not see them.
-        level_start = top.T_camera_top @ make_transform(np.eye(3), np.array([0.0, 0.0, -rack.height_m]))
-        coarse.append(_icp(few, target, level_start, config, config.icp_distances_m[:1]))
-    best = max(coarse, key=lambda r: (round(r.fitness, 3), -r.inlier_rmse_m))
-    fine = config.icp_distances_m[1:]
-    turned_start = best.T_camera_rack @ HALF_TURN
-    return _icp(source, target, best.T_camera_rack, config, fine), _icp(source, target, turned_start, config, fine)
-
-
-def _icp(
-    source: o3d.geometry.PointCloud,
-    target: o3d.geometry.PointCloud,
-    start: FloatArray,
-    config: RackConfig,
-    distances_m: tuple[float, ...],
-) -> _Registration:
-    """Point-to-point ICP of the scan onto the template: each scan point has a partner, each template point need not."""
-    criteria = o3d.pipelines.registration.ICPConvergenceCriteria(max_iteration=config.icp_iterations)
-    method = o3d.pipelines.registration.TransformationEstimationPointToPoint()
-    T_rack_camera = invert_transform(start)
-    for distance_m in distances_m:
-        result = o3d.pipelines.registration.registration_icp(
-            source, target, distance_m, T_rack_camera, method, criteria
-        )
-        # Without any correspondence Open3D reports rmse 0.0 and no error.
-        if result.fitness == 0.0:
-            return _Registration(start, 0.0, float("inf"))
-        T_rack_camera = result.transformation
-    judged = o3d.pipelines.registration.evaluate_registration(source, target, config.judge_distance_m, T_rack_camera)
-    return _Registration(invert_transform(T_rack_camera), float(judged.fitness), float(judged.inlier_rmse))
-
-
-def _choose_turn(
-    best: _Registration,
-    turned: _Registration,
-    rack: RackModel,
-    config: RackConfig,
-    hint: SlotHint | None,
-    intrinsics: CameraIntrinsics | None,
-) -> tuple[_Registration, str]:
-    """The turn to report, and what decided."""
-    if turned.inlier_rmse_m - best.inlier_rmse_m > config.ambiguous_margin_m:
-        return best, "geometry"
-    pair = (best, turned)
-    if hint is not None and intrinsics is not None:
-        point = np.array([*rack.slot(hint.slot).center_m, rack.height_m])
-        pixels = [intrinsics.project(transform_points(r.T_camera_rack, point)) for r in pair]
-        distances = [float(np.hypot(*(pixel - np.array(hint.pixel)))) for pixel in pixels]
-        # A hint far from both places says nothing: swapped coordinates, or a pixel of another image.
-        near = 0.25 * float(np.hypot(*(pixels[0] - pixels[1])))
-        if min(distances) < near < abs(distances[0] - distances[1]):
-            return pair[0 if distances[0] < distances[1] else 1], "hint"
-    # Decided by the image's diagonal: racks stand along the image's sides more often than along its diagonal.
-    return pair[0 if best.T_camera_rack[:2, 0].sum() > 0 else 1], "rule"
+__all__ = ["MIN_POINTS", "RackPose", "RackStatus", "rack_template_m", "register_rack"]

@@ -1,0 +1,161 @@
+"""Registration of the rack by its edges: search, refinement, and the tests that a pose has to pass (method `edges`)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from tubepose.capture.frame import CameraIntrinsics
+from tubepose.capture.session import SlotHint
+from tubepose.config import Config, RackConfig, RackTopConfig
+from tubepose.labware import RackModel
+from tubepose.preprocessing import point_spacing_m, thin
+from tubepose.rack_acceptance import outline_words, too_coarse
+from tubepose.rack_agreement import Agreement, contradiction, measure_agreement
+from tubepose.rack_field import top_field
+from tubepose.rack_fit import Fit, refine
+from tubepose.rack_pose import MIN_POINTS, RackPose, RackStatus, choose_turn
+from tubepose.rack_search import Hypothesis, search
+from tubepose.transforms import HALF_TURN, FloatArray, make_transform
+
+# A rack full of caps shows its lattice better than its ends: so many slots may the search be off.
+SLOT_STEPS = 6
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Registration:
+    """A refined pose and how well the points agree with it."""
+
+    fit: Fit
+    agreement: Agreement
+    reason: str
+
+
+def register_edges(
+    points_m: FloatArray, rack: RackModel, config: Config, hint: SlotHint | None, intrinsics: CameraIntrinsics | None
+) -> RackPose:
+    """One try of `register_rack` by this method, without the suspicions of unit and noise."""
+    if len(points_m) < MIN_POINTS:
+        reason = f"{len(points_m)} valid points on the rack, expected at least {MIN_POINTS}"
+        return RackPose(RackStatus.INSUFFICIENT, reason)
+    best = best_registration(points_m, rack, config)
+    if best is None:
+        return _not_found(points_m, rack, config.rack)
+    spacing_m = best.agreement.spacing_m
+    coarse = too_coarse(spacing_m, rack, config.rack)
+    if coarse:
+        return RackPose(RackStatus.INSUFFICIENT, coarse, spacing_m=spacing_m)
+    return _pose(best, points_m, rack, config, hint, intrinsics)
+
+
+def best_registration(points_m: FloatArray, rack: RackModel, config: Config) -> Registration | None:
+    """The registration with most evidence of those that nothing contradicts, else of all; None where no band is found.
+
+    The first one that sees much of the top is taken: only where little is seen can another place look like the rack.
+    """
+    found: list[Registration] = []
+    for hypothesis in search(coarse_sample(points_m, config.rack_top), rack, config.rack_top):
+        if any(_same(hypothesis.T_camera_rack, other.fit.T_camera_rack, rack) for other in found):
+            continue
+        registration = register_at(points_m, hypothesis.T_camera_rack, rack, config.rack)
+        if not registration.reason and registration.agreement.coverage >= config.rack.clear_seen:
+            return registration
+        if not any(_same(registration.fit.T_camera_rack, other.fit.T_camera_rack, rack) for other in found):
+            found.append(registration)
+    found.sort(key=lambda r: (bool(r.reason), -r.agreement.evidence))
+    if len(found) < 2 or found[1].reason:
+        return found[0] if found else None
+    best, next_best = (registration.agreement.evidence for registration in found[:2])
+    if best >= config.rack.min_rival_ratio * next_best:
+        return found[0]
+    reason = (
+        f"two places look like {rack.name} (evidence {best:.0f} and {next_best:.0f} nats, a ratio of "
+        f"{config.rack.min_rival_ratio:g} expected): too little of its top is seen"
+    )
+    return replace(found[0], reason=reason)
+
+
+def _same(T_a: FloatArray, T_b: FloatArray, rack: RackModel) -> bool:
+    """Whether two poses are within 4 mm and 2 degrees, half turns apart or not."""
+    top = np.array([0.0, 0.0, rack.height_m])
+    apart = np.linalg.norm(T_a[:3, :3] @ top + T_a[:3, 3] - T_b[:3, :3] @ top - T_b[:3, 3])
+    turned = T_a[:3, :3].T @ T_b[:3, :3]
+    return bool(apart < 4e-3 and turned[2, 2] > 0.9994 and abs(turned[0, 0]) > 0.9994)
+
+
+def coarse_sample(points_m: FloatArray, config: RackTopConfig) -> FloatArray:
+    """What the search sees: all of a rack's points are too many, a rack in a whole frame needs more."""
+    return thin(points_m, min(max(config.coarse_points, len(points_m) // 3), config.search_points))
+
+
+def register_at(points_m: FloatArray, T_camera_rack: FloatArray, rack: RackModel, config: RackConfig) -> Registration:
+    """Refine a coarse pose and judge it; where one a slot farther has more evidence, go there first."""
+    fit = refine(points_m, T_camera_rack, rack)
+    agreement = measure_agreement(points_m, fit, rack, config)
+    for _ in range(SLOT_STEPS):
+        if agreement.slot_margin >= 0:
+            break
+        T_step = make_transform(np.eye(3), np.array([*agreement.step_m, 0.0]))
+        farther = refine(points_m, fit.T_camera_rack @ T_step, rack)
+        there = measure_agreement(points_m, farther, rack, config)
+        if there.evidence <= agreement.evidence:
+            break
+        fit, agreement = farther, there
+    return Registration(fit, agreement, contradiction(agreement, rack, config))
+
+
+def _pose(
+    best: Registration,
+    points_m: FloatArray,
+    rack: RackModel,
+    config: Config,
+    hint: SlotHint | None,
+    intrinsics: CameraIntrinsics | None,
+) -> RackPose:
+    turned = best
+    T_turned = best.fit.T_camera_rack @ HALF_TURN
+    if not top_field(rack).symmetric:
+        turned = register_at(points_m, T_turned, rack, config.rack)
+        T_turned = turned.fit.T_camera_rack
+    if turned.agreement.rmse_m < best.agreement.rmse_m:
+        best, turned, T_turned = turned, best, best.fit.T_camera_rack
+    margin_m = turned.agreement.rmse_m - best.agreement.rmse_m
+    index, resolved_by = choose_turn(best.fit.T_camera_rack, T_turned, margin_m, rack, config.rack, hint, intrinsics)
+    chosen, reason = (best, turned)[index], best.reason
+    seen = chosen.agreement
+    return RackPose(
+        RackStatus.REFUSED if reason else RackStatus.OK,
+        reason,
+        None if reason else (best.fit.T_camera_rack, T_turned)[index],
+        seen.rmse_m,
+        seen.fitness,
+        seen.in_slot,
+        seen.coverage,
+        ambiguous=resolved_by == "rule" and not reason,
+        resolved_by="" if reason else resolved_by,
+        turn_margin_m=margin_m if index == 0 else -margin_m,
+        spacing_m=seen.spacing_m,
+        covariance=None if reason else _turned_covariance(chosen.fit.covariance, index == 1 and turned is best),
+    )
+
+
+def _turned_covariance(covariance: FloatArray, turned: bool) -> FloatArray:
+    """The covariance of the other turn of a symmetric rack: x and y change their signs."""
+    signs = np.array([-1.0, -1, 1, -1, -1, 1]) if turned else np.ones(6)
+    return np.asarray(covariance * np.outer(signs, signs))
+
+
+def _not_found(points_m: FloatArray, rack: RackModel, config: RackConfig) -> RackPose:
+    spacing_m = point_spacing_m(points_m)
+    coarse = too_coarse(spacing_m, rack, config)
+    if coarse:
+        return RackPose(RackStatus.INSUFFICIENT, coarse, spacing_m=spacing_m)
+    return RackPose(
+        RackStatus.NOT_FOUND,
+        f"no top of {rack.name} ({outline_words(rack)} mm) among the points; closest: no level band",
+        spacing_m=spacing_m,
+    )
+
+
+__all__ = ["Hypothesis", "Registration", "best_registration", "register_at", "register_edges"]

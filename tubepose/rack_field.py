@@ -1,0 +1,151 @@
+"""What a rack's top looks like to a search: its signed distance on a grid, a coarse picture of it, and its spectrum.
+
+All of it follows from the rack's definition alone, and is computed once per rack.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import fft
+
+from tubepose.labware import RackModel
+from tubepose.transforms import FloatArray
+
+Float32 = NDArray[np.float32]
+# Distances are looked up to first order, so a cell of 0.2 mm errs by less than 0.01 mm on a corner of 2 mm radius.
+GRID_M = 2e-4
+# Nothing is known of what stands this far outside the outline; nearer, the rack's own top would be in the way.
+RING_M = 8e-3
+# How far into a solid part distances are followed; farther ones say no more than that they are far.
+REACH_M = 5e-3
+# Cells of the coarse pictures: as wide as the ribs of most racks.
+PICTURE_M = 2e-3
+TURNS = 180
+# Lengths of the waves that a spectrum is compared at: from wide slots to narrow ribs.
+WAVES_M = (45e-3, 5e-3)
+WAVE_COUNT = 40
+# Tops that differ by less than this from their half turn cannot be told from it by any scan.
+SAME_M = 5e-5
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TopField:
+    """Signed distance to the solid part of a rack's top on a grid.
+
+    Attributes:
+        low_m: Place of the first cell, rack frame, shape (2,), metres.
+        shape: Cells along x and y.
+        table: Per cell the distance (negative in the solid, metres) and its gradient along x and y, shape (X * Y, 3).
+        symmetric: Whether the top is the same after half a turn.
+    """
+
+    low_m: FloatArray
+    shape: tuple[int, int]
+    table: Float32
+    symmetric: bool
+
+    def look_up(self, xy_m: FloatArray) -> tuple[FloatArray, FloatArray, NDArray[np.bool_]]:
+        """Distance (N,), gradient (N, 2) and whether the point lies on the grid (N,), of points (N, 2), rack frame."""
+        cells = (xy_m - self.low_m) * (1 / GRID_M)
+        index = np.rint(cells).astype(np.intp)
+        known = (index[:, 0] >= 0) & (index[:, 0] < self.shape[0]) & (index[:, 1] >= 0) & (index[:, 1] < self.shape[1])
+        flat = np.where(known, index[:, 0] * self.shape[1] + index[:, 1], 0)
+        found = self.table[flat]
+        off = (cells - index) * GRID_M
+        distance = found[:, 0] + off[:, 0] * found[:, 1] + off[:, 1] * found[:, 2]
+        return distance, found[:, 1:], known
+
+
+@lru_cache(maxsize=32)
+def top_field(rack: RackModel) -> TopField:
+    """The signed distance field of a rack's top, out to `RING_M` beyond its outline."""
+    half = rack.outline_m / 2
+    counts = np.ceil((half + RING_M) / GRID_M).astype(int)
+    x, y = (np.arange(-n, n + 1) * GRID_M for n in counts)
+    edge = np.stack(np.broadcast_arrays(np.abs(x)[:, None] - half[0], np.abs(y)[None] - half[1]))
+    outside = np.hypot(*np.maximum(edge, 0))
+    distance = np.maximum(outside + np.minimum(edge.max(axis=0), 0), -REACH_M)
+    for slot in rack.all_slots:
+        window = []
+        for axis, values in enumerate((x, y)):
+            reach = slot.half_size_m[axis] + REACH_M
+            window.append(slice(*np.searchsorted(values, slot.center_m[axis] + np.array([-reach, reach]))))
+        place = tuple(window)
+        xy = np.stack(np.meshgrid(x[place[0]], y[place[1]], indexing="ij"), axis=-1)
+        distance[place] = np.maximum(distance[place], -slot.signed_distance_m(xy))
+    slopes = np.gradient(distance, GRID_M)
+    table = np.stack([distance, *slopes], axis=-1).reshape(-1, 3).astype(np.float32)
+    symmetric = bool(np.abs(distance - distance[::-1, ::-1]).max() < SAME_M)
+    return TopField(np.array([x[0], y[0]]), (len(x), len(y)), table, symmetric)
+
+
+@lru_cache(maxsize=32)
+def picture(rack: RackModel, cell_m: float = PICTURE_M) -> Float32:
+    """The top as cells, (X, Y), centred, odd sides: 1 solid, less than 0 opening or ring around it, 0 beyond.
+
+    Its sum is 0, so that neither a closed surface nor free space looks like a rack.
+    """
+    half = rack.outline_m / 2
+    counts = np.ceil((half + RING_M) / cell_m).astype(int)
+    fine = 4
+    offsets = (np.arange(fine) + 0.5) / fine - 0.5
+    axes = [(np.arange(-n, n + 1)[:, None] + offsets).ravel() * cell_m for n in counts]
+    xy = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
+    field = top_field(rack)
+    distance, _, known = field.look_up(xy.reshape(-1, 2))
+    value = np.where(known, np.where(distance < 0, 1.0, -1.0), 0.0)
+    value[value < 0] *= np.sum(value > 0) / np.sum(value < 0)
+    value = value.reshape(2 * counts[0] + 1, fine, 2 * counts[1] + 1, fine).mean(axis=(1, 3))
+    return value.astype(np.float32)
+
+
+@lru_cache(maxsize=64)
+def picture_spectrum(rack: RackModel, size: int, turned: bool) -> NDArray[np.complex64]:
+    """Conjugate spectrum of the picture in a square of `size` cells, its centre at cell (0, 0)."""
+    image = picture(rack)[::-1, ::-1] if turned else picture(rack)
+    padded = np.zeros((size, size), np.float32)
+    padded[: image.shape[0], : image.shape[1]] = image
+    padded = np.roll(padded, (-(image.shape[0] // 2), -(image.shape[1] // 2)), axis=(0, 1))
+    return np.asarray(np.conj(fft.rfft2(padded)), np.complex64)
+
+
+def turn_signature(spectrum: NDArray[np.complex64], size: int, cell_m: float = PICTURE_M) -> Float32:
+    """How strong a picture's waves are per direction: (TURNS, WAVE_COUNT), each length's mean taken off.
+
+    The strength of waves does not change when the picture is moved, and turns with it: so pictures can be turned onto
+    each other before it is known where they lie. Directions cover half a turn, because a wave has no sign.
+    """
+    places, conjugate = _signature_places(size, cell_m)
+    strength = np.sqrt(np.abs(spectrum.ravel()[places]))
+    del conjugate
+    strength = strength.reshape(TURNS, WAVE_COUNT)
+    strength = strength - strength.mean(axis=0)
+    return np.asarray(strength, np.float32)
+
+
+@lru_cache(maxsize=16)
+def _signature_places(size: int, cell_m: float) -> tuple[NDArray[np.intp], None]:
+    """Where in a flattened half spectrum the waves of every direction and length are."""
+    angles = np.arange(TURNS) * np.pi / TURNS
+    waves = np.geomspace(1 / WAVES_M[0], 1 / WAVES_M[1], WAVE_COUNT) * cell_m * size
+    u = np.rint(np.outer(np.cos(angles), waves)).astype(int)
+    v = np.rint(np.outer(np.sin(angles), waves)).astype(int)
+    negative = v < 0
+    u, v = np.where(negative, -u, u) % size, np.abs(v)
+    return (u * (size // 2 + 1) + v).ravel(), None
+
+
+@lru_cache(maxsize=32)
+def solid_signature(rack: RackModel) -> NDArray[np.complex64]:
+    """Conjugate Fourier transform over the directions of the signature of the solid part."""
+    size = 512
+    image = np.maximum(picture(rack), 0)
+    padded = np.zeros((size, size), np.float32)
+    padded[: image.shape[0], : image.shape[1]] = image
+    signature = turn_signature(fft.rfft2(padded), size)
+    signature /= np.linalg.norm(signature)
+    return np.asarray(np.conj(fft.rfft(signature, axis=0)), np.complex64)

@@ -1,0 +1,269 @@
+"""Where a rack's top could be among points: level directions, height bands, and the picture of the top laid on each.
+
+Every pixel says something about the height of a candidate top: a point at that height says "solid there", a point below
+says "the view through the top is free there", a point above says nothing.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import fft
+
+from tubepose.config import RackTopConfig
+from tubepose.labware import RackModel
+from tubepose.rack_field import PICTURE_M, TURNS, picture, picture_spectrum, solid_signature, top_field, turn_signature
+from tubepose.transforms import FloatArray, make_transform
+
+# Points that planes are drawn from and judged by, and how many planes are drawn: a top of a tenth of the points is
+# drawn twice; planes of rims, caps, floors and the table are as level, and help.
+PLANE_SAMPLE = 1000
+PLANE_DRAWS = 2000
+# Half thickness of a band before its plane is known well, and after.
+ROUGH_BAND_M = 2.5e-3
+BAND_M = 1.2e-3
+# Points this far below are not of the top.
+BELOW_M = 4e-3
+# Directions nearer than this are the same, and peaks of one height.
+SAME_DIRECTION_RAD = 0.05
+SAME_TURN = 4
+# How many angles of a band are tried: a lattice that is nearly square has two.
+TURN_TRIES = 3
+# Poses that are worth a refinement: the best of those tried at a time, if they explain this share of what lies there.
+BEST_PLACED = 2
+LEAST_SHARE = 0.12
+# Points that a band's plane is fitted to, and free ones that a picture is made of.
+PLANE_POINTS = 2000
+FREE_POINTS = 10_000
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Hypothesis:
+    """A pose that the rack could have.
+
+    Attributes:
+        T_camera_rack: Array of shape (4, 4), metres.
+        score: How well the coarse picture of the top explains the band, in cells of rib.
+        share: The same over all cells with points where the picture lies: 1 when all of them are ribs that agree.
+    """
+
+    T_camera_rack: FloatArray
+    score: float
+    share: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Band:
+    """Points about one height, on a plane.
+
+    Attributes:
+        T_camera_band: Frame on the plane, z up (towards the camera), shape (4, 4), metres.
+        solid_m: Points at the plane's height, shape (N, 2), frame of the band, metres.
+        free_m: Where the lines of sight of points below cross the plane, shape (M, 2), metres.
+        free_weight: How many points each of them stands for.
+    """
+
+    T_camera_band: FloatArray
+    solid_m: FloatArray
+    free_m: FloatArray
+    free_weight: float
+
+
+def level_directions(points_m: FloatArray, config: RackTopConfig) -> list[tuple[FloatArray, FloatArray]]:
+    """Normal (towards the camera at the origin) and a point of the dominant planes, the fullest first."""
+    rng = np.random.default_rng(config.seed)
+    sample = points_m[rng.integers(0, len(points_m), PLANE_SAMPLE)]
+    a, b, c = (sample[rng.integers(0, len(sample), PLANE_DRAWS)] for _ in range(3))
+    normals = np.cross(b - a, c - a)
+    length = np.linalg.norm(normals, axis=1)
+    kept = length > 1e-6
+    normals, a = normals[kept] / length[kept, None], a[kept]
+    offsets = np.einsum("ij,ij->i", normals, a)
+    off = sample.astype(np.float32) @ normals.T.astype(np.float32) - offsets.astype(np.float32)
+    counts = np.count_nonzero(np.abs(off) < config.plane_distance_m, axis=0)
+    found: list[tuple[FloatArray, FloatArray]] = []
+    free = np.ones(len(normals), bool)
+    while free.any() and len(found) < config.max_planes:
+        best = int(np.argmax(np.where(free, counts, -1)))
+        if counts[best] < 10:
+            break
+        free &= np.abs(normals @ normals[best]) < np.cos(SAME_DIRECTION_RAD)
+        normal, origin = _settled(sample, normals[best], a[best], config.plane_distance_m)
+        if all(abs(normal @ other) < np.cos(SAME_DIRECTION_RAD) for other, _ in found):
+            found.append((normal, origin))
+    return found
+
+
+def _settled(
+    points_m: FloatArray, normal: FloatArray, origin: FloatArray, distance_m: float
+) -> tuple[FloatArray, FloatArray]:
+    for _ in range(3):
+        near = points_m[np.abs((points_m - origin) @ normal) < distance_m]
+        if len(near) < 10:
+            break
+        normal, origin = fit_plane(near)
+    return (-normal if normal @ origin > 0 else normal), origin
+
+
+def fit_plane(points_m: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Least-squares plane: unit normal towards the camera, and the centroid."""
+    centroid = points_m.mean(axis=0)
+    centred = points_m - centroid
+    normal = np.linalg.eigh(centred.T @ centred)[1][:, 0]
+    return (-normal if normal @ centroid > 0 else normal), centroid
+
+
+def search(points_m: FloatArray, rack: RackModel, config: RackTopConfig) -> Iterator[Hypothesis]:
+    """Poses that a rack could have among points (N, 3), camera frame, metres: the likeliest first, the best placed.
+
+    One level direction after the other is searched, so that whoever is content with the first answer is soon done.
+    """
+    for normal, origin in level_directions(points_m, config):
+        found = [turn for band in bands(points_m, normal, origin, config) for turn in turns(band, rack, TURN_TRIES)]
+        found.sort(key=lambda turn: -turn.strength)
+        for some in (found[:4], found[4:12], found[12:]):
+            placed = [hypothesis for turn in some for hypothesis in place(turn, rack)]
+            placed = [hypothesis for hypothesis in placed if hypothesis.share > LEAST_SHARE]
+            yield from sorted(placed, key=lambda hypothesis: -hypothesis.score * hypothesis.share)[:BEST_PLACED]
+
+
+def bands(points_m: FloatArray, normal: FloatArray, origin: FloatArray, config: RackTopConfig) -> Iterator[Band]:
+    """Candidates for the top at one level direction, the fullest heights first."""
+    x = np.cross([0.0, 1.0, 0.0] if abs(normal[1]) < 0.9 else [1.0, 0.0, 0.0], normal)
+    x /= np.linalg.norm(x)
+    R = np.stack([x, np.cross(normal, x), normal], axis=1)
+    local = (points_m - origin) @ R
+    order = np.argsort(local[:, 2])
+    local = local[order]
+    for height in _peaks(local[:, 2], config):
+        band = _band(local, height, make_transform(R, origin))
+        if band is not None:
+            yield band
+
+
+def _peaks(heights: FloatArray, config: RackTopConfig) -> FloatArray:
+    """Heights (sorted, as they come) with most points."""
+    low, high = heights[int(0.002 * len(heights))], heights[int(0.998 * (len(heights) - 1))]
+    if not 0 < (high - low) / config.bin_m < 20_000:
+        return np.array([(high + low) / 2])
+    edges = np.arange(low - 2 * config.bin_m, high + 3 * config.bin_m, config.bin_m)
+    counts = np.diff(np.searchsorted(heights, edges)).astype(float)
+    smooth = np.convolve(counts, [0.25, 0.5, 1.0, 0.5, 0.25])[2:-2]
+    padded = np.pad(smooth, 1)
+    peaks = np.flatnonzero((smooth >= padded[:-2]) & (smooth > padded[2:]) & (smooth >= 2e-3 * len(heights)))
+    order = peaks[np.argsort(-smooth[peaks], kind="stable")][: config.max_bands]
+    return np.asarray(edges[order] + config.bin_m / 2)
+
+
+def _band(local_m: FloatArray, height: float, T_camera_level: FloatArray) -> Band | None:
+    """The band at a height of points (N, 3) sorted by height, on the plane that they have there."""
+    low, high, below = np.searchsorted(local_m[:, 2], [height - ROUGH_BAND_M, height + ROUGH_BAND_M, height - BELOW_M])
+    rough = local_m[low:high]
+    if len(rough) < 50:
+        return None
+    center, slope = _tilt(rough[:: len(rough) // PLANE_POINTS + 1])
+    near = rough[np.abs(rough[:, 2] - center[2] - (rough[:, :2] - center[:2]) @ slope) < BAND_M]
+    if len(near) >= 50:
+        center, slope = _tilt(near[:: len(near) // PLANE_POINTS + 1])
+    if np.hypot(*slope) > np.tan(SAME_DIRECTION_RAD):
+        return None
+    up = np.array([*-slope, 1.0]) / np.sqrt(1 + slope @ slope)
+    x = np.array([1.0, 0.0, slope[0]]) / np.hypot(1, slope[0])
+    T_level_band = make_transform(np.stack([x, np.cross(up, x), up], axis=1), center)
+    T_camera_band = T_camera_level @ T_level_band
+    flat = (rough - center) @ T_level_band[:3, :3]
+    solid = flat[np.abs(flat[:, 2]) < BAND_M, :2]
+    if len(solid) < 50:
+        return None
+    seen = local_m[:below]
+    seen = (seen[:: len(seen) // FREE_POINTS + 1] - center) @ T_level_band[:3, :3]
+    camera = -T_camera_band[:3, 3] @ T_camera_band[:3, :3]
+    return Band(T_camera_band, solid, crossings(seen, camera), max(1.0, below / FREE_POINTS))
+
+
+def _tilt(points_m: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Centroid (3,) and slopes of z along x and y (2,) of the least-squares plane through points (N, 3)."""
+    center = points_m.mean(axis=0)
+    off = points_m - center
+    slope = np.linalg.solve(off[:, :2].T @ off[:, :2] + 1e-9 * np.eye(2), off[:, :2].T @ off[:, 2])
+    return center, np.asarray(slope)
+
+
+def crossings(below_m: FloatArray, camera_m: FloatArray) -> FloatArray:
+    """Where the lines from the camera to points (N, 3) below cross z = 0, shape (N, 2)."""
+    share = below_m[:, 2] / (below_m[:, 2] - camera_m[2])
+    return np.asarray(below_m[:, :2] + share[:, None] * (camera_m[:2] - below_m[:, :2]))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Turn:
+    band: Band
+    angle_rad: float
+    strength: float
+
+
+def turns(band: Band, rack: RackModel, count: int) -> list[_Turn]:
+    """Angles of the rack's x axis in a band (modulo half a turn), the best first, by the strength of its waves."""
+    low, size = _frame(band.solid_m, rack, padded=False)
+    if size > 1024:
+        return []
+    image = _raster(band.solid_m, low, size)
+    signature = turn_signature(fft.rfft2(np.minimum(image, _full(image))), size)
+    norm = float(np.linalg.norm(signature))
+    match = fft.irfft((fft.rfft(signature, axis=0) * solid_signature(rack)).sum(axis=1), TURNS) / max(norm, 1e-12)
+    found = []
+    for _ in range(count):
+        best = int(match.argmax())
+        found.append(_Turn(band, best * np.pi / TURNS, float(match[best])))
+        match[np.arange(best - SAME_TURN, best + SAME_TURN + 1) % TURNS] = -1
+    return found
+
+
+def _full(image: FloatArray) -> float:
+    """Points of a cell that is seen well: more of them say no more."""
+    return max(1.0, float(np.median(image[image > 0])))
+
+
+def _frame(points_m: FloatArray, rack: RackModel, padded: bool) -> tuple[FloatArray, int]:
+    low, high = np.percentile(points_m, [0.5, 99.5], axis=0)
+    side = float((high - low).max()) + 10e-3
+    if padded:
+        side = max(side, float((high - low).max()) + 0.5 * float(np.hypot(*rack.outline_m)))
+    cells = max(int(side / PICTURE_M), 200) + 1
+    return np.asarray((low + high) / 2 - cells * PICTURE_M / 2), fft.next_fast_len(cells, real=True)
+
+
+def _raster(xy_m: FloatArray, low_m: FloatArray, size: int) -> FloatArray:
+    index = np.floor((xy_m - low_m) * (1 / PICTURE_M)).astype(np.intp)
+    inside = np.all((index >= 0) & (index < size), axis=1)
+    flat = index[inside, 0] * size + index[inside, 1]
+    return np.bincount(flat, minlength=size * size).reshape(size, size).astype(np.float32)
+
+
+def place(turn: _Turn, rack: RackModel) -> list[Hypothesis]:
+    """Where the picture of the top lies best at one angle; for a top that half a turn changes, both ways round."""
+    cos, sin = np.cos(turn.angle_rad), np.sin(turn.angle_rad)
+    T_turned = np.array([[cos, -sin], [sin, cos]])
+    solid, free = turn.band.solid_m @ T_turned, turn.band.free_m @ T_turned
+    low, size = _frame(solid, rack, padded=True)
+    hits, misses = _raster(solid, low, size), _raster(free, low, size) * turn.band.free_weight
+    full = _full(hits)
+    evidence = np.minimum(hits, full) - np.minimum(misses, full)
+    spectrum = fft.rfft2(evidence)
+    half = np.array(picture(rack).shape) // 2
+    found = []
+    for half_turn in (False,) if top_field(rack).symmetric else (False, True):
+        match = fft.irfft2(spectrum * picture_spectrum(rack, size, half_turn), (size, size))
+        i, j = np.unravel_index(int(match.argmax()), match.shape)
+        center = low + (np.array([i, j]) + 0.5) * PICTURE_M
+        R = np.eye(3)
+        R[:2, :2] = T_turned * (-1 if half_turn else 1)
+        T_band_rack = make_transform(R, np.array([*(T_turned @ center), -rack.height_m]))
+        score = float(match[i, j])
+        around = np.abs(evidence[max(0, i - half[0]) : i + half[0] + 1, max(0, j - half[1]) : j + half[1] + 1]).sum()
+        share = score / max(float(around), 1.0)
+        found.append(Hypothesis(turn.band.T_camera_band @ T_band_rack, score / full, share))
+    return found
