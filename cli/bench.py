@@ -108,8 +108,9 @@ def _report(
     slots = slot_accuracy(to_table(tables.slots, SLOT_COLUMNS), measured.truth)
     write_csv(out / "slot_accuracy.csv", slots)
     notes = [_data_note(measured, jobs), *measured.notes, *_rack_notes(tables), _slot_note(slots)]
+    notes += _rival_notes(methods, config, seeds)
     if any(method in STOCHASTIC for method in methods):
-        notes += [*_rival_notes(config, seeds), *_spread_notes(seed_spread(errors))]
+        notes += _spread_notes(seed_spread(errors))
     accuracy = accuracy_table(summary, notes, published)
     timing = timing_table(to_table(tables.timings, TIMING_COLUMNS), [_machine_note()], published)
     for name, table in (("table_accuracy", accuracy), ("table_timing", timing)):
@@ -144,7 +145,14 @@ def _slot_note(slots: pd.DataFrame) -> str:
     )
 
 
-def _rival_notes(config: Config, seeds: int) -> list[str]:
+def _rival_notes(methods: Sequence[str], config: Config, seeds: int) -> list[str]:
+    from tubepose.rivals import PACKAGES, settings_note
+
+    notes = _global_icp_notes(config, seeds) if "global-icp" in methods else []
+    return notes + [settings_note(method, config, seeds) for method in methods if method in PACKAGES]
+
+
+def _global_icp_notes(config: Config, seeds: int) -> list[str]:
     icp = config.icp
     rounds = ", ".join(f"{distance * 1e3:g}" for distance in icp.max_distance_m)
     return [

@@ -40,6 +40,7 @@ def read_methods(names: str) -> tuple[str, ...]:
     """Methods of a comma-separated list."""
     from tubepose.errors import ConfigError
     from tubepose.pipeline import METHODS
+    from tubepose.rivals import require_packages
 
     methods = tuple(dict.fromkeys(name.strip() for name in names.split(",") if name.strip()))
     unknown = [name for name in methods if name not in METHODS]
@@ -47,6 +48,7 @@ def read_methods(names: str) -> tuple[str, ...]:
         raise ConfigError(unknown_name("method", unknown[0], METHODS))
     if not methods:
         raise ConfigError(f"no method is named; expected one or more of {', '.join(METHODS)}")
+    require_packages(methods)
     return methods
 
 

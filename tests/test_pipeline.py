@@ -13,6 +13,7 @@ from tubepose.detection.geometric import GeometricDetector
 from tubepose.labware import load_rack, load_tube
 from tubepose.pipeline import DEFAULT_METHOD, METHODS, STOCHASTIC, estimate_tubes, prepare_scene
 from tubepose.rack import RackStatus
+from tubepose.rivals import PACKAGES
 from tubepose.transforms import make_transform, tilt_rad, transform_points
 from tubepose.tube import TubeStatus
 
@@ -64,9 +65,9 @@ def scene():
 
 
 def test_the_rivals_and_ours_have_their_names():
-    assert set(METHODS) >= {"paper", "upright", "slot-icp", "global-icp"}
+    assert set(METHODS) >= {"paper", "upright", "slot-icp", "global-icp", "kiss-matcher", "gicp"}
     assert DEFAULT_METHOD in METHODS
-    assert set(METHODS) >= STOCHASTIC == {"global-icp"}
+    assert set(METHODS) >= STOCHASTIC == {"global-icp", "kiss-matcher"}
 
 
 def test_slots_and_kinds_of_all_tubes_are_found(scene):
@@ -90,6 +91,8 @@ def test_the_paper_recovers_the_poses_in_both_frames(scene):
 
 @pytest.mark.parametrize("method", sorted(METHODS))
 def test_every_method_answers_for_every_target_once(scene, method):
+    for package in PACKAGES.get(method, ()):
+        pytest.importorskip(package, reason="an extra: pip install 'tubepose[rivals]'")
     seed = 0 if method in STOCHASTIC else None
     estimates, times = estimate_tubes(scene, method, CONFIG, seed)
     assert [estimate.target for estimate in estimates] == list(scene.targets)

@@ -205,21 +205,21 @@ class RivalsConfig(_Section):
         gicp_iterations: Iterations per round.
     """
 
-    kiss_voxel_m: float = Field(default=1.0e-3, gt=0)
-    kiss_normal_radius_m: float = Field(default=3.0e-3, gt=0)
-    kiss_feature_radius_m: float = Field(default=6.0e-3, gt=0)
-    kiss_neighbors: int = Field(default=5, ge=1)
-    kiss_pairs: int = Field(default=400, ge=3)
+    kiss_voxel_m: float = Field(default=0.7e-3, gt=0)
+    kiss_normal_radius_m: float = Field(default=2.4e-3, gt=0)
+    kiss_feature_radius_m: float = Field(default=4.0e-3, gt=0)
+    kiss_neighbors: int = Field(default=10, ge=1)
+    kiss_pairs: int = Field(default=200, ge=3)
     kiss_noise_bound_m: float = Field(default=2.0e-3, gt=0)
     kiss_solver_gain: float = Field(default=0.75, gt=0, le=1)
     kiss_pruning: bool = True
-    kiss_attempts: int = Field(default=20, ge=1)
+    kiss_attempts: int = Field(default=40, ge=1)
     kiss_agree_m: float = Field(default=1.5e-3, gt=0)
-    kiss_refinement: Literal["icp", "gicp"] = "icp"
+    kiss_refinement: Literal["icp", "gicp"] = "gicp"
     gicp_kind: Literal["GICP", "PLANE_ICP", "ICP"] = "GICP"
     gicp_target: Literal["template", "scan"] = "template"
-    gicp_max_distance_m: tuple[float, ...] = Field(default=(2.0e-3, 1.0e-3), min_length=1)
-    gicp_neighbors: int = Field(default=10, ge=5)
+    gicp_max_distance_m: tuple[float, ...] = Field(default=(1.5e-3,), min_length=1)
+    gicp_neighbors: int = Field(default=7, ge=5)
     gicp_iterations: int = Field(default=50, ge=1)
 
 

@@ -16,6 +16,7 @@ from tubepose.detection import Detection, Detector, rows_in_box
 from tubepose.labware import RackModel, TubeModel
 from tubepose.preprocessing import remove_outliers
 from tubepose.rack import RackPose, RackStatus, register_rack
+from tubepose.rivals import fit_gicp, fit_kiss_matcher
 from tubepose.slots import SlotAssignment, assign_slots, crop_to_slot, identify_tube
 from tubepose.transforms import FloatArray, invert_transform, transform_points
 from tubepose.tube import TubeMethod, TubePose, TubeStatus, fit_tube
@@ -25,8 +26,10 @@ METHODS: Mapping[str, TubeMethod] = {
     "upright": fit_upright,
     "slot-icp": fit_slot_icp,
     "global-icp": fit_global_icp,
+    "kiss-matcher": fit_kiss_matcher,
+    "gicp": fit_gicp,
 }
-STOCHASTIC = frozenset({"global-icp"})
+STOCHASTIC = frozenset({"global-icp", "kiss-matcher"})
 DEFAULT_METHOD = "paper"
 
 

@@ -20,7 +20,10 @@ from tubepose.capture.manifest import file_sha256, tree_sha256
 from tubepose.config import Config
 from tubepose.labware import CapModel, RackModel, TubeModel
 
-PACKAGES = ("numpy", "scipy", "open3d", "open3d-cpu", "onnxruntime", "opencv-python-headless", "pandas", "mcap")
+PACKAGES = (
+    "numpy", "scipy", "open3d", "open3d-cpu", "onnxruntime", "opencv-python-headless", "pandas", "mcap",
+    "kiss-matcher", "small_gicp",
+)  # fmt: skip
 
 
 @contextmanager
