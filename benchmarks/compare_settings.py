@@ -1,8 +1,11 @@
 """One method under several settings on the same sessions: how the settings of the tables were chosen.
 
-    python -m benchmarks.compare_settings rivals SESSION...      # settings of global registration + ICP
-    python -m benchmarks.compare_settings objectives SESSION...  # the costs that Eq. 3 can be read as
+    python -m benchmarks.compare_settings rivals SESSION...        # settings of global registration + ICP
+    python -m benchmarks.compare_settings kiss-matcher SESSION...  # settings of KISS-Matcher
+    python -m benchmarks.compare_settings gicp SESSION...          # settings of small_gicp
+    python -m benchmarks.compare_settings objectives SESSION...    # the costs that Eq. 3 can be read as
 
+With --known-rack the rack's pose is the exact one (simulated sessions only), so that its errors hide nothing.
 Prints, per tube and setting: estimates that are ok, failures, mean tilt error, mean distance error of the bottom.
 Choose on sessions of your own; never on those that a table reports.
 """
@@ -10,22 +13,23 @@ Choose on sessions of your own; never on those that a table reports.
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import get_args
 
 import numpy as np
 import pandas as pd
 
-from tubepose.batch import run_jobs, session_jobs
+from tubepose.batch import Job, run_jobs, session_jobs
 from tubepose.capture.session import Session, load_session
-from tubepose.config import Config, IcpConfig, Objective, TubeConfig
+from tubepose.config import Config, IcpConfig, Objective, RivalsConfig, TubeConfig
 from tubepose.detection.geometric import GeometricDetector
 from tubepose.evaluation import evaluate, summarise
 from tubepose.ground_truth import GroundTruthConfig
 from tubepose.provenance import pinned_threads
 from tubepose.records import ESTIMATE_COLUMNS, to_table
-from tubepose.truth_tables import TRUTH_COLUMNS, TruthTables, measure_session
+from tubepose.rivals import require_packages
+from tubepose.truth_tables import TRUTH_COLUMNS, TruthTables, measure_session, with_exact_rack
 
 SEEDS = 2
 
@@ -49,19 +53,78 @@ def rival_settings() -> Iterator[tuple[str, Config]]:
         yield name, Config(icp=base.model_copy(update=change))
 
 
+def kiss_settings() -> Iterator[tuple[str, Config]]:
+    """Settings of KISS-Matcher, one thing changed at a time."""
+    changes: dict[str, dict[str, object]] = {
+        "default": {},
+        "one attempt, all pairs": {"kiss_attempts": 1, "kiss_pairs": 100_000},
+        "10 attempts": {"kiss_attempts": 10},
+        "100 attempts": {"kiss_attempts": 100},
+        "1 partner": {"kiss_neighbors": 1},
+        "5 partners": {"kiss_neighbors": 5},
+        "100 pairs": {"kiss_pairs": 100},
+        "400 pairs": {"kiss_pairs": 400},
+        "noise 1 mm": {"kiss_noise_bound_m": 1e-3},
+        "noise 3 mm": {"kiss_noise_bound_m": 3e-3},
+        "no pruning": {"kiss_pruning": False},
+        "features 6 mm, voxel 1 mm": {
+            "kiss_voxel_m": 1e-3,
+            "kiss_feature_radius_m": 6e-3,
+            "kiss_normal_radius_m": 3e-3,
+        },
+        "refined by ICP": {"kiss_refinement": "icp"},
+    }
+    for name, change in changes.items():
+        yield name, Config(rivals=RivalsConfig.model_validate(change))
+
+
+def gicp_settings() -> Iterator[tuple[str, Config]]:
+    """Settings of small_gicp, one thing changed at a time."""
+    changes: dict[str, dict[str, object]] = {
+        "default": {},
+        "template onto scan": {"gicp_target": "scan"},
+        "PLANE_ICP": {"gicp_kind": "PLANE_ICP"},
+        "PLANE_ICP, template onto scan": {"gicp_kind": "PLANE_ICP", "gicp_target": "scan"},
+        "ICP": {"gicp_kind": "ICP"},
+        "1 mm": {"gicp_max_distance_m": (1e-3,)},
+        "2, 1 mm": {"gicp_max_distance_m": (2e-3, 1e-3)},
+        "4, 1.5 mm": {"gicp_max_distance_m": (4e-3, 1.5e-3)},
+        "10 neighbours": {"gicp_neighbors": 10},
+        "20 neighbours": {"gicp_neighbors": 20},
+    }
+    for name, change in changes.items():
+        yield name, Config(rivals=RivalsConfig.model_validate(change))
+
+
 def objective_settings() -> Iterator[tuple[str, Config]]:
     """The named objectives of the cylinder fit."""
     for name in get_args(Objective):
         yield name, Config(tube=TubeConfig(objective=name))
 
 
-def compare(sessions: Sequence[Session], method: str, settings: Iterator[tuple[str, Config]]) -> pd.DataFrame:
+GROUPS: dict[str, tuple[str, Callable[[], Iterator[tuple[str, Config]]]]] = {
+    "rivals": ("global-icp", rival_settings),
+    "kiss-matcher": ("kiss-matcher", kiss_settings),
+    "gicp": ("gicp", gicp_settings),
+    "objectives": ("paper", objective_settings),
+}
+
+
+def session_jobs_of(session: Session, known_rack: bool) -> list[Job]:
+    """One job per trial, with the rack's exact pose if that is asked for."""
+    jobs = session_jobs(session)[0]
+    return with_exact_rack(jobs, session) if known_rack else jobs
+
+
+def compare(
+    sessions: Sequence[Session], method: str, settings: Iterator[tuple[str, Config]], *, known_rack: bool = False
+) -> pd.DataFrame:
     """Summary rows per tube and setting."""
     truth = TruthTables()
     for session in sessions:
         measure_session(session, truth, GroundTruthConfig())
     models = {tube.name: tube for session in sessions for tube in session.tubes.values()}
-    jobs = [job for session in sessions for job in session_jobs(session)[0]]
+    jobs = [job for session in sessions for job in session_jobs_of(session, known_rack)]
     rows = []
     for name, config in settings:
         tables = run_jobs(
@@ -89,14 +152,16 @@ def compare(sessions: Sequence[Session], method: str, settings: Iterator[tuple[s
 
 
 def main() -> None:
-    """Parse the two arguments and print a Markdown table."""
-    which, *folders = sys.argv[1:] or ["help"]
-    if which not in ("rivals", "objectives") or not folders:
+    """Parse the arguments and print a Markdown table."""
+    known_rack = "--known-rack" in sys.argv
+    which, *folders = [text for text in sys.argv[1:] if text != "--known-rack"] or ["help"]
+    if which not in GROUPS or not folders:
         sys.exit(__doc__)
+    method, settings = GROUPS[which]
+    require_packages([method])
     sessions = [load_session(Path(folder)) for folder in folders]
-    method, settings = ("global-icp", rival_settings()) if which == "rivals" else ("paper", objective_settings())
     with pinned_threads(1):
-        table = compare(sessions, method, settings)
+        table = compare(sessions, method, settings(), known_rack=known_rack)
     print("| " + " | ".join(table.columns) + " |")
     print("|" + "---|" * len(table.columns))
     for row in table.itertuples(index=False):
