@@ -88,12 +88,22 @@ class RackConfig(_Section):
         max_in_slot_share: Largest share of such points: fitness alone accepts a rack of another pitch.
         min_coverage: Smallest share of the template that is seen.
         ambiguous_margin_m: Two turns whose rmse differ by less are not told apart by geometry.
-        edge_margin_m: The same as slot_margin_m for method ``edges``, which looks at a thinner layer.
-        min_seen: Smallest share of the template that is seen, for method ``edges``: a rack full of caps shows little.
+        edge_margin_m: The same for method ``edges``, which judges a thinner layer: three pixels.
+        max_stray_share: Largest share of such points. On `dev` the right rack has up to 5 %, whatever stands in it, a rack
+            of another pitch 12 % or more.
+        max_outside_share: Largest share of the top's points just outside the outline (right rack: 0.1 %).
+        max_stretch: How much farther apart, or nearer, than defined slots may lie, beyond three standard deviations.
+        max_through_share: Largest share of what is seen in place of ribs that lies below them (right rack: 2 %).
+        min_seen: Smallest share of the template that is seen: a rack full of caps shows 17 %.
         clear_seen: With this share seen, an accepted pose is not compared with all others that the search can find.
-        max_through_share: Largest share of what is seen in place of ribs that lies below them.
+        max_unseen_share: Largest share of the top with no points on it, above or below: half of it makes a rack of
+            another shape fit.
         min_slot_margin: Smallest evidence, in nats, against the rack standing a slot farther.
         min_rival_ratio: Smallest ratio of the evidence of a pose to that of the next one that is accepted too.
+        max_level_deg: Where less than clear_seen is seen, the largest tilt off the level that the search found.
+        max_level_deg: float = 1.5
+    max_turn_std_deg: Largest standard deviation of a pose about any axis.
+        max_shift_std_mm: Largest standard deviation of a pose along any axis.
         max_spacing_ratio: Largest point spacing, in units of the rack's narrowest rib; coarser is insufficient.
     """
 
@@ -109,12 +119,19 @@ class RackConfig(_Section):
     max_in_slot_share: float = 0.06
     min_coverage: float = 0.25
     ambiguous_margin_m: float = 5.0e-5
-    edge_margin_m: float = 1.0e-3
-    min_seen: float = 0.05
+    edge_margin_m: float = 6.0e-4
+    max_stray_share: float = 0.08
+    max_outside_share: float = 0.01
+    max_stretch: float = 0.03
+    max_through_share: float = 0.1
+    min_seen: float = 0.1
     clear_seen: float = 0.25
-    max_through_share: float = 0.5
+    max_unseen_share: float = 0.4
     min_slot_margin: float = 10.0
     min_rival_ratio: float = 1.5
+    max_level_deg: float = 1.5
+    max_turn_std_deg: float = 0.3
+    max_shift_std_mm: float = 0.3
     max_spacing_ratio: float = 1.0
 
 
@@ -151,6 +168,52 @@ class TubeConfig(_Section):
     max_tilt_rad: float = 0.0872665
     tolerance_m: float = 5.0e-4
     min_points: int = 25
+
+
+class ProfileConfig(_Section):
+    """The whole-profile estimator `profile` (docs/method.md, "Profile").
+
+    Attributes:
+        top_band_m: Points this near a closed top's expected height can be of it.
+        rim_depth_m: Points this far below an open rim's height can be of it.
+        min_support: Least share of a top that is seen, less the share of its surroundings.
+        reach_m: Added to what a slot lets a tube's top reach, for the rack's error and for looser slots.
+        min_top_points: Fewer points than this make no plane.
+        shared_error_m: Depth error that neighbouring points share, standard deviation.
+        shared_error_reach_m: How far it is shared.
+        outline_noise_m: Standard deviation of the radius at which a sector of a top ends.
+        outline_bias_m: Standard deviation of a circle's middle beyond what its sectors explain.
+        rim_noise_m: As `outline_noise_m`, of the bright ring of a rim.
+        rim_bias_m: As `outline_bias_m`, of the bright ring of a rim.
+        wall_noise_m: Standard deviation of points on a wall that can be believed, a label's say.
+        wall_radius_m: Standard deviation of a wall's radius.
+        wall_redundancy: How many neighbouring points of a wall count as one: they share their error.
+        min_wall_points: Fewer points near a wall's radius say nothing.
+        cap_tilt_rad: Standard deviation of how crooked a cap sits, about each of two axes.
+        slope_std: Width of the proposal in the slope of the axis; wider than any slot allows.
+        slot_tolerance_m: How soft the walls of the slot and the edge of its floor's play are.
+        widening_m: Standard deviation of a circle's apparent radius, and of how elliptic it looks.
+    """
+
+    top_band_m: float = 1.5e-3
+    rim_depth_m: float = 3.5e-3
+    min_support: float = 0.3
+    reach_m: float = 1.5e-3
+    min_top_points: int = 30
+    shared_error_m: float = 2.0e-5
+    shared_error_reach_m: float = 3.0e-3
+    outline_noise_m: float = 1.2e-4
+    outline_bias_m: float = 8.0e-5
+    widening_m: float = 3.0e-4
+    rim_noise_m: float = 2.0e-4
+    rim_bias_m: float = 5.0e-5
+    cap_tilt_rad: float = 0.0030
+    wall_noise_m: float = 1.5e-4
+    wall_radius_m: float = 1.0e-4
+    wall_redundancy: float = 6.0
+    min_wall_points: int = 12
+    slope_std: float = 0.035
+    slot_tolerance_m: float = 1.0e-4
 
 
 class IcpConfig(_Section):
@@ -231,6 +294,7 @@ class Config(_Section):
     rack: RackConfig = RackConfig()
     slots: SlotConfig = SlotConfig()
     tube: TubeConfig = TubeConfig()
+    profile: ProfileConfig = ProfileConfig()
     icp: IcpConfig = IcpConfig()
     rivals: RivalsConfig = RivalsConfig()
 

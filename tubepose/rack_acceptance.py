@@ -33,17 +33,8 @@ def outline_words(rack: RackModel) -> str:
     return " x ".join(f"{side:g}" for side in rack.outline_mm)
 
 
-def refusal(
-    fitness: float,
-    rmse_m: float,
-    in_slot: float,
-    coverage: float,
-    rack: RackModel,
-    config: RackConfig,
-    min_coverage: float | None = None,
-) -> str:
-    """Why a registration is no rack, in words; empty if it is one. `min_coverage` goes before the config's."""
-    min_coverage = config.min_coverage if min_coverage is None else min_coverage
+def refusal(fitness: float, rmse_m: float, in_slot: float, coverage: float, rack: RackModel, config: RackConfig) -> str:
+    """Why a registration is no rack, in words; empty if it is one."""
     checks = (
         (fitness < config.min_fitness, f"fitness {fitness:.3f}, at least {config.min_fitness} expected"),
         (
@@ -56,8 +47,8 @@ def refusal(
             f"at most {config.max_in_slot_share:.1%} expected: another rack?",
         ),
         (
-            coverage < min_coverage,
-            f"{coverage:.1%} of the top seen, at least {min_coverage:.0%} expected",
+            coverage < config.min_coverage,
+            f"{coverage:.1%} of the top seen, at least {config.min_coverage:.0%} expected",
         ),
     )
     return "; ".join(text for failed, text in checks if failed)

@@ -15,14 +15,16 @@ from scipy.spatial import cKDTree
 
 from tubepose.config import RackConfig
 from tubepose.labware import RackModel
-from tubepose.rack_acceptance import refusal
 from tubepose.rack_field import PICTURE_M, picture, top_field
-from tubepose.rack_fit import EDGE_SHIFT_M, WRONG_SHARE, Fit, Labels, label
+from tubepose.rack_fit import EDGE_SHIFT_M, WRONG_SHARE, Fit, Labels, label, to_frame, top_frame
+from tubepose.rack_search import crossings
 from tubepose.transforms import FloatArray
 
-# Heights that are judged: three standard deviations, but at least those of a good sensor, and no more than the layer
-# that a tube's wall fills with few points.
-JUDGED_M = (0.3e-3, 1.0e-3)
+# Half thickness of the layer that is judged: the standard deviation of heights, but at least that of a good sensor, and
+# no more than the layer that a tube's wall fills with few points.
+JUDGED_M = (0.3e-3, 0.6e-3)
+# A top that goes on across its outline is another; a rack that stands beside it may be this near.
+BORDER_M = 3.5e-3
 # Blur of an edge in what counts as evidence: it must forgive a pixel.
 EVIDENCE_BLUR_M = 0.4e-3
 # Points that evidence is counted on where it is counted several times.
@@ -32,6 +34,8 @@ INDEPENDENT_M = 1.5e-3
 # Lines of sight this far inside a rib pass through it.
 THROUGH_MARGIN_M = 0.5e-3
 SPACING_SAMPLE = 300
+# Degrees and millimetres, with their part of a covariance.
+_UNITS = ((np.rad2deg(1.0), slice(0, 3)), (1e3, slice(3, 6)))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -48,6 +52,8 @@ class Agreement:
         slot_margin: The same less that of the likeliest pose a slot farther along the rows, columns or diagonals.
         step_m: Where that pose's top lies, in the frame of this one's, shape (2,), metres.
         spacing_m: Median distance of neighbouring points at the top's height.
+        outside: Share of the points at its height that lie just outside the outline.
+        unseen: Share of the solid part near which there are no points at all, neither on, nor above, nor below it.
     """
 
     rmse_m: float = float("nan")
@@ -59,36 +65,55 @@ class Agreement:
     slot_margin: float = 0.0
     step_m: tuple[float, float] = (0.0, 0.0)
     spacing_m: float = float("nan")
+    outside: float = 0.0
+    unseen: float = 0.0
 
 
 def measure_agreement(points_m: FloatArray, fit: Fit, rack: RackModel, config: RackConfig) -> Agreement:
     """Compare points (N, 3), camera frame, with a fit."""
-    window_m = float(np.clip(3 * fit.scatter_m, *JUDGED_M))
+    window_m = float(np.clip(fit.scatter_m, *JUDGED_M))
     seen = label(points_m, fit.T_camera_rack, rack, window_m)
-    field = top_field(rack)
-    distance, _, known = field.look_up(seen.solid_m[:, :2])
+    top = top_field(rack)
+    distance, _, known = top.look_up(seen.solid_m[:, :2])
     solid, distance = seen.solid_m[known], distance[known]
     if len(solid) < 20:
         return Agreement()
-    free_distance, _, free_known = field.look_up(seen.free_m)
+    free_distance, _, free_known = top.look_up(seen.free_m)
     under = np.count_nonzero(free_distance[free_known] < -THROUGH_MARGIN_M)
     over = np.count_nonzero(distance < -THROUGH_MARGIN_M)
     near = distance < config.judge_distance_m
-    inside = np.all(np.abs(solid[:, :2]) <= rack.outline_m / 2, axis=1)
+    beyond = np.max(np.abs(solid[:, :2]) - rack.outline_m / 2, axis=1)
+    stray = distance > config.edge_margin_m
     spacing_m = _spacing(solid)
     evidence, beside, step_m = _evidence(seen, rack)
     alike = min(1.0, (spacing_m / INDEPENDENT_M) ** 2)
     return Agreement(
-        float(np.sqrt(np.mean(solid[near, 2] ** 2 + np.maximum(distance[near], 0) ** 2))),
-        float(np.mean(near)),
-        float(np.mean(distance[inside] > config.edge_margin_m)),
-        under / max(under + over, 1),
-        _coverage(solid, rack),
-        evidence * alike,
-        (evidence - beside) * alike,
-        step_m,
-        spacing_m,
+        rmse_m=float(np.sqrt(np.mean(solid[near, 2] ** 2 + np.maximum(distance[near], 0) ** 2))),
+        fitness=float(np.mean(near)),
+        in_slot=float(np.mean(stray[beyond <= 0])) if np.any(beyond <= 0) else 1.0,
+        outside=float(np.mean(stray & (beyond > 0) & (beyond < BORDER_M))),
+        through=under / max(under + over, 1),
+        coverage=_coverage(solid, rack),
+        unseen=_unseen(points_m, fit, rack),
+        evidence=evidence * alike,
+        slot_margin=(evidence - beside) * alike,
+        step_m=step_m,
+        spacing_m=spacing_m,
     )
+
+
+def _unseen(points_m: FloatArray, fit: Fit, rack: RackModel) -> float:
+    cell_m = 4 * PICTURE_M
+    T = top_frame(fit.T_camera_rack, rack)
+    local = to_frame(points_m[:: len(points_m) // 20_000 + 1], T)
+    camera = -T[:3, 3] @ T[:3, :3]
+    xy = crossings(local, camera)
+    shape = np.ceil(rack.outline_m / cell_m).astype(int)
+    cells = np.floor((xy + rack.outline_m / 2) / rack.outline_m * shape).astype(np.intp)
+    cells = cells[np.all((cells >= 0) & (cells < shape), axis=1)]
+    hit = np.zeros(shape, bool)
+    hit[cells[:, 0], cells[:, 1]] = True
+    return float(1 - hit.mean())
 
 
 def _evidence(seen: Labels, rack: RackModel) -> tuple[float, float, tuple[float, float]]:
@@ -146,17 +171,53 @@ def _spacing(points_m: FloatArray) -> float:
     return float(np.median(np.asarray(distance)[:, 1]))
 
 
-def contradiction(seen: Agreement, rack: RackModel, config: RackConfig) -> str:
+def contradiction(seen: Agreement, fit: Fit, rack: RackModel, config: RackConfig) -> str:
     """Why a fit is not the rack, in words; empty if it is."""
-    reasons = [refusal(seen.fitness, seen.rmse_m, seen.in_slot, seen.coverage, rack, config, config.min_seen)]
-    if seen.through > config.max_through_share:
-        reasons.append(
+    stretch = np.abs(fit.stretch) - 3 * fit.stretch_std
+    turn_deg, shift_mm = (scale * np.sqrt(np.diag(fit.covariance)[k].max()) for scale, k in _UNITS)
+    checks = (
+        (
+            seen.rmse_m > config.max_inlier_rmse_m,
+            f"inlier rmse {seen.rmse_m * 1e3:.2f} mm, at most {config.max_inlier_rmse_m * 1e3:.2f} mm expected",
+        ),
+        (
+            seen.in_slot > config.max_stray_share,
+            f"{seen.in_slot:.1%} of the top's points lie inside the openings of {rack.name}, "
+            f"at most {config.max_stray_share:.1%} expected: another rack?",
+        ),
+        (
+            seen.outside > config.max_outside_share,
+            f"{seen.outside:.1%} of the top's points lie just outside the outline of {rack.name}, "
+            f"at most {config.max_outside_share:.1%} expected: another rack?",
+        ),
+        (
+            bool(np.any(stretch > config.max_stretch)),
+            f"the slots lie {fit.stretch[0]:+.1%} and {fit.stretch[1]:+.1%} farther apart than those of {rack.name}, "
+            f"at most {config.max_stretch:.0%} expected: another rack?",
+        ),
+        (
+            seen.through > config.max_through_share,
             f"{seen.through:.1%} of what is seen in place of the top's solid part lies below it, "
-            f"at most {config.max_through_share:.0%} expected"
-        )
-    if seen.slot_margin < config.min_slot_margin:
-        reasons.append(
-            "the rack could as well stand a slot farther: too little of its outline and edge is seen "
-            f"(margin {seen.slot_margin:.0f} nats, at least {config.min_slot_margin:.0f} expected)"
-        )
-    return "; ".join(reason for reason in reasons if reason)
+            f"at most {config.max_through_share:.0%} expected",
+        ),
+        (
+            seen.coverage < config.min_seen,
+            f"{seen.coverage:.1%} of the top seen, at least {config.min_seen:.0%} expected",
+        ),
+        (
+            seen.unseen > config.max_unseen_share,
+            f"no points at all on {seen.unseen:.0%} of the top, at most {config.max_unseen_share:.0%} expected: "
+            "is the rack in the image as a whole?",
+        ),
+        (
+            seen.slot_margin < config.min_slot_margin,
+            "the rack could as well stand a slot farther: too little of its edge is seen "
+            f"(margin {seen.slot_margin:.0f} nats, at least {config.min_slot_margin:.0f} expected)",
+        ),
+        (
+            turn_deg > config.max_turn_std_deg or shift_mm > config.max_shift_std_mm,
+            f"its pose is uncertain by {turn_deg:.2f} deg and {shift_mm:.2f} mm (standard deviations), at most "
+            f"{config.max_turn_std_deg:g} deg and {config.max_shift_std_mm:g} mm expected: too little of the top is seen",
+        ),
+    )
+    return "; ".join(text for failed, text in checks if failed)

@@ -61,6 +61,7 @@ def best_registration(points_m: FloatArray, rack: RackModel, config: Config) -> 
         registration = register_at(points_m, hypothesis.T_camera_rack, rack, config.rack)
         if not registration.reason and registration.agreement.coverage >= config.rack.clear_seen:
             return registration
+        registration = _level(registration, hypothesis.level, config.rack)
         if not any(_same(registration.fit.T_camera_rack, other.fit.T_camera_rack, rack) for other in found):
             found.append(registration)
     found.sort(key=lambda r: (bool(r.reason), -r.agreement.evidence))
@@ -74,6 +75,18 @@ def best_registration(points_m: FloatArray, rack: RackModel, config: Config) -> 
         f"{config.rack.min_rival_ratio:g} expected): too little of its top is seen"
     )
     return replace(found[0], reason=reason)
+
+
+def _level(registration: Registration, level: FloatArray, config: RackConfig) -> Registration:
+    """The same, refused where a pose that little is seen of does not stand as level as the rest of the scene."""
+    tilt_deg = float(np.rad2deg(np.arccos(min(1.0, float(registration.fit.T_camera_rack[:3, 2] @ level)))))
+    if registration.reason or tilt_deg <= config.max_level_deg:
+        return registration
+    reason = (
+        f"{registration.agreement.coverage:.1%} of the top seen, and it stands {tilt_deg:.1f} deg off the level of the "
+        f"scene, at most {config.max_level_deg:g} deg expected"
+    )
+    return replace(registration, reason=reason)
 
 
 def _same(T_a: FloatArray, T_b: FloatArray, rack: RackModel) -> bool:
@@ -102,7 +115,7 @@ def register_at(points_m: FloatArray, T_camera_rack: FloatArray, rack: RackModel
         if there.evidence <= agreement.evidence:
             break
         fit, agreement = farther, there
-    return Registration(fit, agreement, contradiction(agreement, rack, config))
+    return Registration(fit, agreement, contradiction(agreement, fit, rack, config))
 
 
 def _pose(

@@ -30,18 +30,23 @@ FINE_POINTS = 20_000
 EDGE_SHIFT_M = 0.2e-3
 # Share of pixels that say the wrong thing wherever they are: bounds what one of them can do.
 WRONG_SHARE = 0.05
+LEAST_POINTS = 20
 # Points this far inside the solid part are on the plane; nearer to an edge, pixels mix two depths.
 INSIDE_M = 0.2e-3
 # The plane is fitted within three standard deviations, but no narrower than three of a good sensor's 0.08 mm.
 LEAST_WINDOW_M = 0.25e-3
 # Points below this far are seen through the top: nearer ones may be mixed with it.
 THROUGH_M = 10e-3
+# The slots' distances are fitted with a blur that reaches from one rack's ribs to another's.
+STRETCH_ROUNDS = 4
+STRETCH_BLUR_M = 0.5e-3
 # How far beside a top points are looked at: a slot and its ribs.
 BESIDE_M = 30e-3
-# Neighbours share their depth's error, and an edge's: so many millimetres of points count as one.
+# Neighbours share their depth's error: squares of this length count as one, if they have this many points. Light that goes
+# astray is alike over a slot and its ribs: what a pose's error is estimated from.
 SHARED_LENGTH_M = 3e-3
-SHARED_HEIGHT_M = 0.05e-3
-SHARED_EDGE_M = 0.3e-3
+FULL_SQUARE = 5
+CLUSTER_M = 20e-3
 # What no number of points takes away: calibration, and shadows and hidden sides that are on the same side everywhere.
 FLOOR = np.array([3e-4, 3e-4, 2e-4, 5e-5, 5e-5, 5e-5])
 
@@ -54,11 +59,15 @@ class Fit:
         T_camera_rack: Array of shape (4, 4), metres.
         covariance: (6, 6), rotation vector (rad) then translation (m), rack frame, about the centre of the top.
         scatter_m: Standard deviation of heights about the plane, from their median, metres.
+        stretch: By how much the slots lie farther apart than the rack's along x and y: 0 for the right rack.
+        stretch_std: Standard deviations of that.
     """
 
     T_camera_rack: FloatArray
     covariance: FloatArray
     scatter_m: float
+    stretch: FloatArray
+    stretch_std: FloatArray
 
 
 @dataclass(slots=True, eq=False)
@@ -66,7 +75,7 @@ class _State:
     T_camera_top: FloatArray
     window_m: float
     scatter_m: float
-    information: FloatArray
+    covariance: FloatArray
 
 
 def top_frame(T_camera_rack: FloatArray, rack: RackModel) -> FloatArray:
@@ -77,7 +86,7 @@ def top_frame(T_camera_rack: FloatArray, rack: RackModel) -> FloatArray:
 def refine(points_m: FloatArray, T_camera_rack: FloatArray, rack: RackModel) -> Fit:
     """Refine a coarse pose (2 mm and 1.5 degrees off at most) with points (N, 3), camera frame, metres."""
     field = top_field(rack)
-    state = _State(top_frame(T_camera_rack, rack), ROUNDS_M[0][1], ROUNDS_M[0][1], np.zeros((6, 6)))
+    state = _State(top_frame(T_camera_rack, rack), ROUNDS_M[0][1], ROUNDS_M[0][1], np.eye(6))
     local = to_frame(points_m, state.T_camera_top)
     reach = rack.outline_m / 2 + 5e-3
     near = (np.abs(local[:, 2]) < 5e-3) & (np.abs(local[:, 0]) < reach[0]) & (np.abs(local[:, 1]) < reach[1])
@@ -85,9 +94,9 @@ def refine(points_m: FloatArray, T_camera_rack: FloatArray, rack: RackModel) -> 
     rough, fine = kept[:: len(kept) // ROUGH_POINTS + 1], kept[:: len(kept) // FINE_POINTS + 1]
     for number, (blur_m, window_m) in enumerate(ROUNDS_M):
         _step(rough if number < ROUGH_ROUNDS else fine, state, field, blur_m, window_m)
-    covariance = np.linalg.inv(state.information + np.diag([1e2, 1e2, 1e2, 1e4, 1e4, 1e4])) + np.diag(FLOOR**2)
+    covariance = state.covariance + np.diag(FLOOR**2)
     T = state.T_camera_top @ make_transform(np.eye(3), np.array([0.0, 0.0, -rack.height_m]))
-    return Fit(T, covariance, state.scatter_m)
+    return Fit(T, covariance, state.scatter_m, *_stretch(rough, state, field))
 
 
 def to_frame(points_m: FloatArray, T_camera_frame: FloatArray) -> FloatArray:
@@ -102,38 +111,73 @@ def _step(points_m: FloatArray, state: _State, field: TopField, blur_m: float, l
     local = local[np.abs(local[:, 2]) < state.window_m]
     distance, slope, known = field.look_up(local[:, :2])
     local, distance, slope = local[known], distance[known], slope[known].astype(float)
-    state.information = np.zeros((6, 6))
+    state.covariance = np.eye(6)
     move = np.zeros(6)
     inside = distance < -INSIDE_M
-    if inside.sum() >= 20:
+    if inside.sum() >= LEAST_POINTS:
         plane, edges = np.ix_([0, 1, 5], [0, 1, 5]), np.ix_([2, 3, 4], [2, 3, 4])
-        move[[0, 1, 5]], state.information[plane], state.scatter_m = _plane(local[inside], state.window_m)
-        move[[2, 3, 4]], state.information[edges] = _edges(local[:, :2], distance, slope, blur_m)
+        move[[0, 1, 5]], state.covariance[plane], state.scatter_m = _plane(local[inside], state.window_m)
+        move[[2, 3, 4]], state.covariance[edges] = _edges(local[:, :2], distance, slope, blur_m)
     T_step = make_transform(Rotation.from_rotvec(move[:3]).as_matrix(), move[3:])
     state.T_camera_top = state.T_camera_top @ T_step
 
 
+def _stretch(points_m: FloatArray, state: _State, field: TopField) -> tuple[FloatArray, FloatArray]:
+    """Stretch along x and y with which the template agrees best, and its standard deviations."""
+    local = to_frame(points_m, state.T_camera_top)
+    xy = local[np.abs(local[:, 2]) < state.window_m, :2]
+    moved = np.zeros(5)
+    covariance = np.eye(5)
+    for _ in range(STRETCH_ROUNDS):
+        turn = np.array([[1.0, -moved[0]], [moved[0], 1.0]])
+        places = (xy - moved[1:3]) @ turn / (1 + moved[3:])
+        distance, slope, known = field.look_up(places)
+        if known.sum() < LEAST_POINTS:
+            return np.zeros(2), np.full(2, np.inf)
+        step, covariance = _edges(places[known], distance[known], slope[known].astype(float), STRETCH_BLUR_M, True)
+        moved = moved + step
+    return moved[3:], np.sqrt(np.diag(covariance))[3:]
+
+
 def _plane(points_m: FloatArray, window_m: float) -> tuple[FloatArray, FloatArray, float]:
-    """Turns about x and y, and height, of the plane where heights are densest; their information; their scatter."""
+    """Turns about x and y, and height, of the plane where heights are densest; their covariance; their scatter.
+
+    Places count alike, however many points they have: light that goes astray lifts or sinks whole stretches of ribs, and
+    a wall at the outline has most of the points.
+    """
     x, y, h = points_m.T
     design = np.column_stack([y, -x, np.ones(len(x))])
     found = np.array([0.0, 0.0, _mode(h, window_m)])
+    balance = _balance(points_m)
     width = window_m
     for _ in range(4):
         off = h - design @ found
         scatter = float(1.4826 * np.median(np.abs(off[np.abs(off) < width])))
         width = float(np.clip(3 * scatter, LEAST_WINDOW_M, width))
-        weight = np.maximum(1 - (off / width) ** 2, 0) ** 2
+        weight = balance * np.maximum(1 - (off / width) ** 2, 0) ** 2
         normal = design.T @ (weight[:, None] * design) + np.diag([1e-9, 1e-9, 1e-6])
         found = found + np.linalg.solve(normal, design.T @ (weight * off))
-    cells, total = _patches(points_m[weight > 0.2]), max(float(weight.sum()), 1.0)
-    return found, normal * (cells / total) / (SHARED_HEIGHT_M**2 + scatter**2 * cells / total), scatter
+    scores = (weight * (h - design @ found))[:, None] * design
+    return found, _clustered(normal, scores, points_m), scatter
 
 
-def _patches(points_m: FloatArray) -> int:
-    """How many squares of the length that errors are shared over hold points."""
+def _balance(points_m: FloatArray) -> FloatArray:
+    """Weight of every point that makes all squares of the shared length count alike, those with few points less."""
     cells = np.rint(points_m[:, :2] / SHARED_LENGTH_M).astype(np.intp)
-    return max(1, len(np.unique(cells[:, 0] * 4096 + cells[:, 1])))
+    cells -= cells.min(axis=0)
+    index = cells[:, 0] * (cells[:, 1].max() + 1) + cells[:, 1]
+    return 1 / np.maximum(np.bincount(index), FULL_SQUARE)[index]
+
+
+def _clustered(normal: FloatArray, scores: FloatArray, points_m: FloatArray) -> FloatArray:
+    """Covariance of a fit whose residuals are alike within squares of `CLUSTER_M`, and independent between them."""
+    cells = np.floor(points_m[:, :2] / CLUSTER_M).astype(np.intp)
+    cells -= cells.min(axis=0)
+    index = cells[:, 0] * (cells[:, 1].max() + 1) + cells[:, 1]
+    sums = np.stack([np.bincount(index, column) for column in scores.T], axis=1)
+    count = int(np.count_nonzero(np.bincount(index)))
+    inverse = np.linalg.inv(normal)
+    return np.asarray(inverse @ (sums.T @ sums) @ inverse * (count / max(count - len(normal), 1)))
 
 
 def _mode(h: FloatArray, window_m: float) -> float:
@@ -143,8 +187,13 @@ def _mode(h: FloatArray, window_m: float) -> float:
     return float(bins[int(counts.argmax())] + window_m / 40)
 
 
-def _edges(xy_m: FloatArray, distance_m: FloatArray, slope: FloatArray, blur_m: float) -> tuple[FloatArray, FloatArray]:
-    """Yaw and shift along x and y that put points on the solid part, by a step of Fisher scoring; their information."""
+def _edges(
+    xy_m: FloatArray, distance_m: FloatArray, slope: FloatArray, blur_m: float, stretch: bool = False
+) -> tuple[FloatArray, FloatArray]:
+    """Yaw, shift along x and y, and stretch along them if asked for, that put points on the solid part.
+
+    One step of Fisher scoring, and the covariance of where the steps end.
+    """
     eta = (EDGE_SHIFT_M - distance_m) / blur_m
     near = np.abs(eta) < 6
     eta, g, xy = eta[near], slope[near], xy_m[near]
@@ -152,14 +201,16 @@ def _edges(xy_m: FloatArray, distance_m: FloatArray, slope: FloatArray, blur_m: 
     chance = WRONG_SHARE + (1 - 2 * WRONG_SHARE) * plain
     rate = (1 - 2 * WRONG_SHARE) * plain * (1 - plain)
     # Moving the rack by t moves a point by -t in its frame.
-    design = np.column_stack([g[:, 1] * xy[:, 0] - g[:, 0] * xy[:, 1], g]) / blur_m
-    weight = rate**2 / (chance * (1 - chance))
-    information = design.T @ (weight[:, None] * design)
-    step = np.linalg.solve(information + np.diag([1e1, 1e5, 1e5]), design.T @ (rate / chance))
-    step *= min(1.0, 1e-3 / max(float(np.abs(step[1:]).max()), 1e-12))
-    cells = _patches(xy[np.abs(eta) < 2])
-    total = max(float(weight.sum()), 1e-9)
-    return step, information * (blur_m**2 * cells / total / SHARED_EDGE_M**2)
+    columns = [g[:, 1] * xy[:, 0] - g[:, 0] * xy[:, 1], g[:, 0], g[:, 1]]
+    if stretch:
+        columns += [g[:, 0] * xy[:, 0], g[:, 1] * xy[:, 1]]
+    design = np.column_stack(columns) / blur_m
+    information = design.T @ ((rate**2 / (chance * (1 - chance)))[:, None] * design)
+    information += np.diag([1e1, 1e5, 1e5, 1e1, 1e1][: len(columns)])
+    scores = (rate / chance)[:, None] * design
+    step = np.linalg.solve(information, scores.sum(axis=0))
+    step *= min(1.0, 1e-3 / max(float(np.abs(step[1:3]).max()), 1e-12))
+    return step, _clustered(information, scores, xy)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

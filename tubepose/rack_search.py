@@ -47,12 +47,14 @@ class Hypothesis:
     Attributes:
         T_camera_rack: Array of shape (4, 4), metres.
         score: How well the coarse picture of the top explains the band, in cells of rib.
+        level: Normal of the level direction that it was found at, shape (3,).
         share: The same over all cells with points where the picture lies: 1 when all of them are ribs that agree.
     """
 
     T_camera_rack: FloatArray
     score: float
     share: float
+    level: FloatArray
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -64,12 +66,14 @@ class Band:
         solid_m: Points at the plane's height, shape (N, 2), frame of the band, metres.
         free_m: Where the lines of sight of points below cross the plane, shape (M, 2), metres.
         free_weight: How many points each of them stands for.
+        level: Normal of the level direction that it was found at, shape (3,).
     """
 
     T_camera_band: FloatArray
     solid_m: FloatArray
     free_m: FloatArray
     free_weight: float
+    level: FloatArray
 
 
 def level_directions(points_m: FloatArray, config: RackTopConfig) -> list[tuple[FloatArray, FloatArray]]:
@@ -181,7 +185,7 @@ def _band(local_m: FloatArray, height: float, T_camera_level: FloatArray) -> Ban
     seen = local_m[:below]
     seen = (seen[:: len(seen) // FREE_POINTS + 1] - center) @ T_level_band[:3, :3]
     camera = -T_camera_band[:3, 3] @ T_camera_band[:3, :3]
-    return Band(T_camera_band, solid, crossings(seen, camera), max(1.0, below / FREE_POINTS))
+    return Band(T_camera_band, solid, crossings(seen, camera), max(1.0, below / FREE_POINTS), T_camera_level[:3, 2])
 
 
 def _tilt(points_m: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -265,5 +269,5 @@ def place(turn: _Turn, rack: RackModel) -> list[Hypothesis]:
         score = float(match[i, j])
         around = np.abs(evidence[max(0, i - half[0]) : i + half[0] + 1, max(0, j - half[1]) : j + half[1] + 1]).sum()
         share = score / max(float(around), 1.0)
-        found.append(Hypothesis(turn.band.T_camera_band @ T_band_rack, score / full, share))
+        found.append(Hypothesis(turn.band.T_camera_band @ T_band_rack, score / full, share, turn.band.level))
     return found
