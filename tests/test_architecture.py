@@ -29,7 +29,7 @@ ALLOWED: dict[str, set[str]] = {
     "rack_search": {"config", "labware", "rack_field"},
     "rack_fit": {"labware", "rack_field", "rack_search"},
     "rack_acceptance": {"config", "labware"},
-    "rack_agreement": {"config", "labware", "rack_acceptance", "rack_field", "rack_fit"},
+    "rack_agreement": {"config", "labware", "rack_field", "rack_fit", "rack_search"},
     "rack_pose": {"capture", "config", "labware"},
     "rack_edges": {
         "capture",

@@ -66,7 +66,7 @@ class RackTopConfig(_Section):
     outline_tolerance_m: float = 5.0e-3
     max_in_slot_share: float = 0.3
     search_points: int = 100_000
-    coarse_points: int = 30_000
+    coarse_points: int = 20_000
     seed: int = 0
 
 
@@ -93,7 +93,7 @@ class RackConfig(_Section):
             of another pitch 12 % or more.
         max_outside_share: Largest share of the top's points just outside the outline (right rack: 0.1 %).
         max_stretch: How much farther apart, or nearer, than defined slots may lie, beyond three standard deviations.
-        max_through_share: Largest share of what is seen in place of ribs that lies below them (right rack: 2 %).
+        max_through_share: Largest share of what is seen in place of ribs that lies below them (right rack: 3 %).
         min_seen: Smallest share of the template that is seen: a rack full of caps shows 17 %.
         clear_seen: With this share seen, an accepted pose is not compared with all others that the search can find.
         max_unseen_share: Largest share of the top with no points on it, above or below: half of it makes a rack of
@@ -123,7 +123,7 @@ class RackConfig(_Section):
     max_stray_share: float = 0.08
     max_outside_share: float = 0.01
     max_stretch: float = 0.03
-    max_through_share: float = 0.1
+    max_through_share: float = 0.3
     min_seen: float = 0.1
     clear_seen: float = 0.25
     max_unseen_share: float = 0.4
@@ -177,6 +177,9 @@ class ProfileConfig(_Section):
         top_band_m: Points this near a closed top's expected height can be of it.
         rim_depth_m: Points this far below an open rim's height can be of it.
         min_support: Least share of a top that is seen, less the share of its surroundings.
+        min_rim_support: The same of an open rim.
+        min_rim_sectors: A rim with less support than a closed top must have this share of its ring in the image.
+        min_sectors: Least share of a top's circle whose end is seen.
         reach_m: Added to what a slot lets a tube's top reach, for the rack's error and for looser slots.
         min_top_points: Fewer points than this make no plane.
         shared_error_m: Depth error that neighbouring points share, standard deviation.
@@ -189,15 +192,23 @@ class ProfileConfig(_Section):
         wall_radius_m: Standard deviation of a wall's radius.
         wall_redundancy: How many neighbouring points of a wall count as one: they share their error.
         min_wall_points: Fewer points near a wall's radius say nothing.
+        cap_height_m: Standard deviation of the height at which a cap sits, with the scanner's own error.
         cap_tilt_rad: Standard deviation of how crooked a cap sits, about each of two axes.
         slope_std: Width of the proposal in the slope of the axis; wider than any slot allows.
         slot_tolerance_m: How soft the walls of the slot and the edge of its floor's play are.
+        min_allowed: Least share of what the measurements leave open that the slot must allow.
+        max_height_error_m: A closed top farther off its height than this is rejected.
+        max_tilt_std_rad: A tilt that is not known better than this is rejected.
+        score_tilt_rad: Standard deviation of the tilt at which the score is a half.
         widening_m: Standard deviation of a circle's apparent radius, and of how elliptic it looks.
     """
 
     top_band_m: float = 1.5e-3
     rim_depth_m: float = 3.5e-3
     min_support: float = 0.3
+    min_rim_support: float = 0.1
+    min_rim_sectors: float = 0.6
+    min_sectors: float = 0.4
     reach_m: float = 1.5e-3
     min_top_points: int = 30
     shared_error_m: float = 2.0e-5
@@ -207,6 +218,7 @@ class ProfileConfig(_Section):
     widening_m: float = 3.0e-4
     rim_noise_m: float = 2.0e-4
     rim_bias_m: float = 5.0e-5
+    cap_height_m: float = 3.0e-4
     cap_tilt_rad: float = 0.0030
     wall_noise_m: float = 1.5e-4
     wall_radius_m: float = 1.0e-4
@@ -214,6 +226,10 @@ class ProfileConfig(_Section):
     min_wall_points: int = 12
     slope_std: float = 0.035
     slot_tolerance_m: float = 1.0e-4
+    min_allowed: float = 1.0e-3
+    max_height_error_m: float = 1.2e-3
+    max_tilt_std_rad: float = 0.0105
+    score_tilt_rad: float = 0.0035
 
 
 class IcpConfig(_Section):

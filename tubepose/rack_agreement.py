@@ -16,23 +16,26 @@ from scipy.spatial import cKDTree
 from tubepose.config import RackConfig
 from tubepose.labware import RackModel
 from tubepose.rack_field import PICTURE_M, picture, top_field
-from tubepose.rack_fit import EDGE_SHIFT_M, WRONG_SHARE, Fit, Labels, label, to_frame, top_frame
+from tubepose.rack_fit import EDGE_SHIFT_M, LEAST_POINTS, WRONG_SHARE, Fit, Labels, label, to_frame, top_frame
 from tubepose.rack_search import crossings
 from tubepose.transforms import FloatArray
 
 # Half thickness of the layer that is judged: the standard deviation of heights, but at least that of a good sensor, and
 # no more than the layer that a tube's wall fills with few points.
 JUDGED_M = (0.3e-3, 0.6e-3)
+# Heights that tell how rough a scan is.
+SCATTER_M = 2.5e-3
 # A top that goes on across its outline is another; a rack that stands beside it may be this near.
 BORDER_M = 3.5e-3
 # Blur of an edge in what counts as evidence: it must forgive a pixel.
 EVIDENCE_BLUR_M = 0.4e-3
 # Points that evidence is counted on where it is counted several times.
-EVIDENCE_POINTS = 6000
+EVIDENCE_POINTS = 3000
 # Points nearer than this share their label's error: they count as one.
 INDEPENDENT_M = 1.5e-3
 # Lines of sight this far inside a rib pass through it.
 THROUGH_MARGIN_M = 0.5e-3
+STRIP_POINTS = 3000
 SPACING_SAMPLE = 300
 # Degrees and millimetres, with their part of a covariance.
 _UNITS = ((np.rad2deg(1.0), slice(0, 3)), (1e3, slice(3, 6)))
@@ -43,7 +46,8 @@ class Agreement:
     """How well points agree with a pose.
 
     Attributes:
-        rmse_m: RMS distance of the points near the top to its solid part, metres.
+        rmse_m: RMS distance of the points near the top to its solid part, metres; the part along the normal from the median
+            of all heights within `SCATTER_M`, so that it tells a rough scan from a good one with stray light.
         fitness: Share of the points at its height that are near its solid part.
         in_slot: Share of them that lie in its openings.
         through: Share of what is seen where the solid part should be that lies below it.
@@ -76,7 +80,7 @@ def measure_agreement(points_m: FloatArray, fit: Fit, rack: RackModel, config: R
     top = top_field(rack)
     distance, _, known = top.look_up(seen.solid_m[:, :2])
     solid, distance = seen.solid_m[known], distance[known]
-    if len(solid) < 20:
+    if len(solid) < LEAST_POINTS or not np.any(distance < 0):
         return Agreement()
     free_distance, _, free_known = top.look_up(seen.free_m)
     under = np.count_nonzero(free_distance[free_known] < -THROUGH_MARGIN_M)
@@ -84,11 +88,13 @@ def measure_agreement(points_m: FloatArray, fit: Fit, rack: RackModel, config: R
     near = distance < config.judge_distance_m
     beyond = np.max(np.abs(solid[:, :2]) - rack.outline_m / 2, axis=1)
     stray = distance > config.edge_margin_m
-    spacing_m = _spacing(solid)
+    ribs = _on_ribs(points_m, fit, rack)
+    spacing_m = _spacing(ribs[:, :2])
+    scatter_m = float(1.4826 * np.median(np.abs(ribs[:, 2])))
     evidence, beside, step_m = _evidence(seen, rack)
     alike = min(1.0, (spacing_m / INDEPENDENT_M) ** 2)
     return Agreement(
-        rmse_m=float(np.sqrt(np.mean(solid[near, 2] ** 2 + np.maximum(distance[near], 0) ** 2))),
+        rmse_m=float(np.hypot(scatter_m, np.sqrt(np.mean(np.maximum(distance[near], 0) ** 2)))),
         fitness=float(np.mean(near)),
         in_slot=float(np.mean(stray[beyond <= 0])) if np.any(beyond <= 0) else 1.0,
         outside=float(np.mean(stray & (beyond > 0) & (beyond < BORDER_M))),
@@ -102,10 +108,18 @@ def measure_agreement(points_m: FloatArray, fit: Fit, rack: RackModel, config: R
     )
 
 
+def _on_ribs(points_m: FloatArray, fit: Fit, rack: RackModel) -> FloatArray:
+    """Points near the solid part of the top, frame of the top, shape (N, 3), metres; rough scans have more of them."""
+    local = to_frame(points_m, top_frame(fit.T_camera_rack, rack))
+    local = local[np.abs(local[:, 2]) < SCATTER_M]
+    distance, _, known = top_field(rack).look_up(local[:, :2])
+    return np.asarray(local[known & (distance < 0)])
+
+
 def _unseen(points_m: FloatArray, fit: Fit, rack: RackModel) -> float:
     cell_m = 4 * PICTURE_M
     T = top_frame(fit.T_camera_rack, rack)
-    local = to_frame(points_m[:: len(points_m) // 20_000 + 1], T)
+    local = to_frame(points_m[:: len(points_m) // 10_000 + 1], T)
     camera = -T[:3, 3] @ T[:3, :3]
     xy = crossings(local, camera)
     shape = np.ceil(rack.outline_m / cell_m).astype(int)
@@ -158,17 +172,26 @@ def slot_steps_m(rack: RackModel) -> tuple[FloatArray, ...]:
 def _coverage(solid_m: FloatArray, rack: RackModel) -> float:
     top = picture(rack)
     half = np.array(top.shape) // 2
-    cells = np.rint(solid_m[:, :2] / PICTURE_M).astype(np.intp) + half
-    cells = cells[np.all((cells >= 0) & (cells < top.shape), axis=1)]
-    hit = np.zeros(top.shape, bool)
-    hit[cells[:, 0], cells[:, 1]] = True
-    return float(hit[top > 0].mean())
+    i, j = np.rint(solid_m[:, 0] / PICTURE_M) + half[0], np.rint(solid_m[:, 1] / PICTURE_M) + half[1]
+    inside = (i >= 0) & (i < top.shape[0]) & (j >= 0) & (j < top.shape[1])
+    cells = (i * top.shape[1] + j)[inside].astype(np.intp)
+    return float(np.mean(np.bincount(cells, minlength=top.size)[top.ravel() > 0] > 0))
 
 
 def _spacing(points_m: FloatArray) -> float:
+    """Median distance to the nearest neighbour, in a strip of points (N, 2) through their middle."""
+    if len(points_m) > STRIP_POINTS:
+        first = (len(points_m) - STRIP_POINTS) // 2
+        order = np.argpartition(points_m[:, 0], [first, first + STRIP_POINTS - 1])
+        points_m = points_m[order[first : first + STRIP_POINTS]]
     tree = cKDTree(points_m, balanced_tree=False, compact_nodes=False)
     distance, _ = tree.query(points_m[:: len(points_m) // SPACING_SAMPLE + 1], k=2)
     return float(np.median(np.asarray(distance)[:, 1]))
+
+
+def outline_fits(seen: Agreement, config: RackConfig) -> bool:
+    """Whether the top ends where the rack's does, and is there as a whole: something else is a rack that is not found."""
+    return seen.outside <= config.max_outside_share and seen.unseen <= config.max_unseen_share
 
 
 def contradiction(seen: Agreement, fit: Fit, rack: RackModel, config: RackConfig) -> str:

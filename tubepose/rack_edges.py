@@ -12,7 +12,7 @@ from tubepose.config import Config, RackConfig, RackTopConfig
 from tubepose.labware import RackModel
 from tubepose.preprocessing import point_spacing_m, thin
 from tubepose.rack_acceptance import outline_words, too_coarse
-from tubepose.rack_agreement import Agreement, contradiction, measure_agreement
+from tubepose.rack_agreement import Agreement, contradiction, measure_agreement, outline_fits
 from tubepose.rack_field import top_field
 from tubepose.rack_fit import Fit, refine
 from tubepose.rack_pose import MIN_POINTS, RackPose, RackStatus, choose_turn
@@ -21,6 +21,8 @@ from tubepose.transforms import HALF_TURN, FloatArray, make_transform
 
 # A rack full of caps shows its lattice better than its ends: so many slots may the search be off.
 SLOT_STEPS = 6
+# Places whose coarse picture agrees less than this, compared with one that was accepted, are no rivals of it.
+RIVAL_WORTH = 0.4
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -41,11 +43,13 @@ def register_edges(
         return RackPose(RackStatus.INSUFFICIENT, reason)
     best = best_registration(points_m, rack, config)
     if best is None:
-        return _not_found(points_m, rack, config.rack)
+        return _not_found(points_m, rack, config.rack, "no level band")
     spacing_m = best.agreement.spacing_m
     coarse = too_coarse(spacing_m, rack, config.rack)
     if coarse:
         return RackPose(RackStatus.INSUFFICIENT, coarse, spacing_m=spacing_m)
+    if best.reason and not outline_fits(best.agreement, config.rack):
+        return _not_found(points_m, rack, config.rack, best.reason)
     return _pose(best, points_m, rack, config, hint, intrinsics)
 
 
@@ -55,13 +59,18 @@ def best_registration(points_m: FloatArray, rack: RackModel, config: Config) -> 
     The first one that sees much of the top is taken: only where little is seen can another place look like the rack.
     """
     found: list[Registration] = []
+    worth = 0.0
     for hypothesis in search(coarse_sample(points_m, config.rack_top), rack, config.rack_top):
+        if hypothesis.worth < RIVAL_WORTH * worth:
+            continue
         if any(_same(hypothesis.T_camera_rack, other.fit.T_camera_rack, rack) for other in found):
             continue
         registration = register_at(points_m, hypothesis.T_camera_rack, rack, config.rack)
         if not registration.reason and registration.agreement.coverage >= config.rack.clear_seen:
             return registration
         registration = _level(registration, hypothesis.level, config.rack)
+        if not registration.reason:
+            worth = max(worth, hypothesis.worth)
         if not any(_same(registration.fit.T_camera_rack, other.fit.T_camera_rack, rack) for other in found):
             found.append(registration)
     found.sort(key=lambda r: (bool(r.reason), -r.agreement.evidence))
@@ -159,14 +168,14 @@ def _turned_covariance(covariance: FloatArray, turned: bool) -> FloatArray:
     return np.asarray(covariance * np.outer(signs, signs))
 
 
-def _not_found(points_m: FloatArray, rack: RackModel, config: RackConfig) -> RackPose:
+def _not_found(points_m: FloatArray, rack: RackModel, config: RackConfig, closest: str) -> RackPose:
     spacing_m = point_spacing_m(points_m)
     coarse = too_coarse(spacing_m, rack, config)
     if coarse:
         return RackPose(RackStatus.INSUFFICIENT, coarse, spacing_m=spacing_m)
     return RackPose(
         RackStatus.NOT_FOUND,
-        f"no top of {rack.name} ({outline_words(rack)} mm) among the points; closest: no level band",
+        f"no top of {rack.name} ({outline_words(rack)} mm) among the points; closest: {closest}",
         spacing_m=spacing_m,
     )
 

@@ -20,8 +20,8 @@ from tubepose.transforms import FloatArray, make_transform
 
 # Points that planes are drawn from and judged by, and how many planes are drawn: a top of a tenth of the points is
 # drawn twice; planes of rims, caps, floors and the table are as level, and help.
-PLANE_SAMPLE = 1000
-PLANE_DRAWS = 2000
+PLANE_SAMPLE = 600
+PLANE_DRAWS = 1500
 # Half thickness of a band before its plane is known well, and after.
 ROUGH_BAND_M = 2.5e-3
 BAND_M = 1.2e-3
@@ -32,9 +32,13 @@ SAME_DIRECTION_RAD = 0.05
 SAME_TURN = 4
 # How many angles of a band are tried: a lattice that is nearly square has two.
 TURN_TRIES = 3
-# Poses that are worth a refinement: the best of those tried at a time, if they explain this share of what lies there.
+# Poses that are worth a refinement: the best of those tried at a time, if they explain this share of what lies there; any
+# with a larger one, at once.
 BEST_PLACED = 2
 LEAST_SHARE = 0.12
+# Pictures of more than 1.6 m are not searched: no capture that shows ribs is as wide.
+MOST_CELLS = 800
+CLEAR_SHARE = 0.3
 # Points that a band's plane is fitted to, and free ones that a picture is made of.
 PLANE_POINTS = 2000
 FREE_POINTS = 10_000
@@ -56,6 +60,11 @@ class Hypothesis:
     share: float
     level: FloatArray
 
+    @property
+    def worth(self) -> float:
+        """What hypotheses are ranked by: much is explained, and little else lies there."""
+        return self.score * self.share
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Band:
@@ -76,7 +85,7 @@ class Band:
     level: FloatArray
 
 
-def level_directions(points_m: FloatArray, config: RackTopConfig) -> list[tuple[FloatArray, FloatArray]]:
+def level_directions(points_m: FloatArray, config: RackTopConfig) -> Iterator[tuple[FloatArray, FloatArray]]:
     """Normal (towards the camera at the origin) and a point of the dominant planes, the fullest first."""
     rng = np.random.default_rng(config.seed)
     sample = points_m[rng.integers(0, len(points_m), PLANE_SAMPLE)]
@@ -86,8 +95,9 @@ def level_directions(points_m: FloatArray, config: RackTopConfig) -> list[tuple[
     kept = length > 1e-6
     normals, a = normals[kept] / length[kept, None], a[kept]
     offsets = np.einsum("ij,ij->i", normals, a)
-    off = sample.astype(np.float32) @ normals.T.astype(np.float32) - offsets.astype(np.float32)
-    counts = np.count_nonzero(np.abs(off) < config.plane_distance_m, axis=0)
+    off = normals.astype(np.float32) @ sample.T.astype(np.float32)
+    off -= offsets[:, None].astype(np.float32)
+    counts = np.count_nonzero(np.abs(off, out=off) < config.plane_distance_m, axis=1)
     found: list[tuple[FloatArray, FloatArray]] = []
     free = np.ones(len(normals), bool)
     while free.any() and len(found) < config.max_planes:
@@ -98,7 +108,7 @@ def level_directions(points_m: FloatArray, config: RackTopConfig) -> list[tuple[
         normal, origin = _settled(sample, normals[best], a[best], config.plane_distance_m)
         if all(abs(normal @ other) < np.cos(SAME_DIRECTION_RAD) for other, _ in found):
             found.append((normal, origin))
-    return found
+            yield normal, origin
 
 
 def _settled(
@@ -129,9 +139,13 @@ def search(points_m: FloatArray, rack: RackModel, config: RackTopConfig) -> Iter
         found = [turn for band in bands(points_m, normal, origin, config) for turn in turns(band, rack, TURN_TRIES)]
         found.sort(key=lambda turn: -turn.strength)
         for some in (found[:4], found[4:12], found[12:]):
-            placed = [hypothesis for turn in some for hypothesis in place(turn, rack)]
-            placed = [hypothesis for hypothesis in placed if hypothesis.share > LEAST_SHARE]
-            yield from sorted(placed, key=lambda hypothesis: -hypothesis.score * hypothesis.share)[:BEST_PLACED]
+            placed = []
+            for hypothesis in (hypothesis for turn in some for hypothesis in place(turn, rack)):
+                if hypothesis.share > CLEAR_SHARE:
+                    yield hypothesis
+                elif hypothesis.share > LEAST_SHARE:
+                    placed.append(hypothesis)
+            yield from sorted(placed, key=lambda hypothesis: -hypothesis.worth)[:BEST_PLACED]
 
 
 def bands(points_m: FloatArray, normal: FloatArray, origin: FloatArray, config: RackTopConfig) -> Iterator[Band]:
@@ -212,7 +226,7 @@ class _Turn:
 def turns(band: Band, rack: RackModel, count: int) -> list[_Turn]:
     """Angles of the rack's x axis in a band (modulo half a turn), the best first, by the strength of its waves."""
     low, size = _frame(band.solid_m, rack, padded=False)
-    if size > 1024:
+    if size > MOST_CELLS:
         return []
     image = _raster(band.solid_m, low, size)
     signature = turn_signature(fft.rfft2(np.minimum(image, _full(image))), size)
