@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from tubepose.config import Config
     from tubepose_cli.truth import MeasuredTruth
 
-ALL_METHODS = "upright,paper,slot-icp,global-icp"
+ALL_METHODS = "upright,profile,paper,slot-icp,global-icp"
 
 
 def bench(
@@ -36,6 +36,10 @@ def bench(
     overlays: Annotated[bool, typer.Option(help="Write one overlay picture per frame.")] = False,
     known_rack: Annotated[
         bool, typer.Option("--known-rack", help="Take the rack's pose from the exact truth (simulated sessions only).")
+    ] = False,
+    exact_truth: Annotated[
+        bool,
+        typer.Option("--exact-truth", help="Judge by the exact poses of the simulation, not by measured printed caps."),
     ] = False,
     published: Annotated[bool, typer.Option("--published", help="Add the paper's own figures to the tables.")] = False,
     fail_fast: Annotated[bool, typer.Option("--fail-fast", help="Stop at the first bad capture.")] = False,
@@ -59,7 +63,7 @@ def bench(
     detector_for = make_detector(detector, model, boxes, classes, layout, settings)
     jobs: list[Job] = []
     folders, problems = find_sessions(sessions or [sample_session()], fail_fast=fail_fast)
-    measured = measure_sessions(folders, out, fail_fast=fail_fast)
+    measured = measure_sessions(folders, out, exact=exact_truth, fail_fast=fail_fast)
     for session in measured.sessions:
         try:
             found, unread = session_jobs(session, fail_fast=fail_fast)
@@ -94,6 +98,7 @@ def _report(
     from tubepose.records import ESTIMATE_COLUMNS, SLOT_COLUMNS, TIMING_COLUMNS, to_table
     from tubepose.report.tables import accuracy_table, timing_table
     from tubepose.report.writing import write_csv, write_table
+    from tubepose.uncertainty import coverage, uncertainty
     from tubepose_cli.show import say, show_table
 
     estimates = to_table(tables.estimates, ESTIMATE_COLUMNS)
@@ -102,12 +107,15 @@ def _report(
     summary = summarise(errors, methods)
     write_csv(out / "errors.csv", errors)
     write_csv(out / "summary.csv", summary)
-    reference = "paper" if "paper" in methods else methods[0]
+    reference = next((name for name in ("profile", "paper") if name in methods), methods[0])
     write_csv(out / "comparison.csv", compare(errors, reference))
+    write_csv(out / "uncertainty.csv", uncertainty(errors))
+    write_csv(out / "coverage.csv", coverage(errors))
     write_csv(out / "seeds.csv", seed_spread(errors))
     slots = slot_accuracy(to_table(tables.slots, SLOT_COLUMNS), measured.truth)
     write_csv(out / "slot_accuracy.csv", slots)
-    notes = [_data_note(measured, jobs), *measured.notes, *_rack_notes(tables), _slot_note(slots)]
+    notes = [_data_note(measured, jobs), *measured.notes, *_rack_notes(tables), *_slot_notes(slots)]
+    notes += _uncertainty_notes(errors)
     notes += _rival_notes(methods, config, seeds)
     if any(method in STOCHASTIC for method in methods):
         notes += _spread_notes(seed_spread(errors))
@@ -135,14 +143,27 @@ def _rack_notes(tables: Tables) -> list[str]:
     return [f"Racks: {ok} of {len(frames)} frames with an accepted pose."]
 
 
-def _slot_note(slots: pd.DataFrame) -> str:
-    first = slots.iloc[0] if len(slots) else None
-    if first is None:
-        return "Slots: none judged."
-    return (
-        f"Slots (all methods share them): {first['n_found']} of {first['n_occupied']} occupied ones found, "
-        f"{first['n_left_empty']} of {first['n_empty']} empty ones left empty."
-    )
+def _slot_notes(slots: pd.DataFrame) -> list[str]:
+    """Slots that were found, once for all methods that share them."""
+    told: dict[str, list[str]] = {}
+    for row in slots.to_dict("records"):
+        words = (
+            f"{row['n_found']} of {row['n_occupied']} occupied ones found, "
+            f"{row['n_left_empty']} of {row['n_empty']} empty ones left empty"
+        )
+        told.setdefault(words, []).append(str(row["method"]))
+    return [f"Slots ({', '.join(methods)}): {words}." for words, methods in told.items()] or ["Slots: none judged."]
+
+
+def _uncertainty_notes(errors: pd.DataFrame) -> list[str]:
+    from tubepose.uncertainty import ALL_TUBES, uncertainty
+
+    rows = [row for row in uncertainty(errors).to_dict("records") if row["tube"] == ALL_TUBES]
+    return [
+        f"{row['method']}: {row['inside_95']:.1%} of {row['n']} truths inside the stated 95 % region; mean tilt error "
+        f"{row['tilt_deg_all']:.2f} deg of all, {row['tilt_deg_best_half']:.2f} of the half with the higher scores."
+        for row in rows
+    ]
 
 
 def _rival_notes(methods: Sequence[str], config: Config, seeds: int) -> list[str]:

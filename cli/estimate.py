@@ -19,7 +19,9 @@ def estimate(
         str | None,
         typer.Option(help="Kinds of tube that can be there: names or files, with commas; goes before a session's own."),
     ] = None,
-    method: Annotated[str, typer.Option(help="paper, upright, slot-icp or global-icp.")] = "paper",
+    method: Annotated[
+        str, typer.Option(help="profile, paper, upright, slot-icp, global-icp, kiss-matcher or gicp.")
+    ] = ("profile"),
     detector: Annotated[str, typer.Option(help="Source of boxes: geometric, yolo or recorded.")] = "geometric",
     model: Annotated[Path | None, typer.Option(help="ONNX file of --detector yolo.")] = None,
     boxes: Annotated[Path | None, typer.Option(help="Boxes of --detector recorded: YOLO txt or COCO json.")] = None,

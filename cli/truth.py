@@ -13,6 +13,9 @@ if TYPE_CHECKING:
     from tubepose.capture.session import Session
 
 
+EXACT_NOTE = "Truth: the exact poses of the simulation, not those measured from printed caps."
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class MeasuredTruth:
     """What was measured.
@@ -34,8 +37,10 @@ class MeasuredTruth:
     config: dict[str, Any]
 
 
-def measure_sessions(folders: Sequence[Path], out: Path, *, fail_fast: bool = False) -> MeasuredTruth:
-    """Measure all sessions and write ground_truth.csv (and ground_truth_floor.csv if one is simulated) into `out`."""
+def measure_sessions(
+    folders: Sequence[Path], out: Path, *, exact: bool = False, fail_fast: bool = False
+) -> MeasuredTruth:
+    """Measure all sessions (or take the exact poses of simulated ones) and write ground_truth.csv (and ground_truth_floor.csv if one is simulated) into `out`."""
     from dataclasses import asdict
 
     from tubepose.capture.session import load_session
@@ -48,6 +53,7 @@ def measure_sessions(folders: Sequence[Path], out: Path, *, fail_fast: bool = Fa
         FLOOR_COLUMNS,
         TRUTH_COLUMNS,
         TruthTables,
+        exact_truth_rows,
         floor_note,
         measure_session,
         refused_note,
@@ -73,10 +79,13 @@ def measure_sessions(folders: Sequence[Path], out: Path, *, fail_fast: bool = Fa
     tables = TruthTables()
     with pinned_threads(1), progress("ground truth", sum(len(s.trials) for s in sessions)) as step:
         for session in sessions:
-            measure_session(session, tables, config, fail_fast=fail_fast, on_done=step)
+            if exact:
+                tables.truth += exact_truth_rows(session)
+            else:
+                measure_session(session, tables, config, fail_fast=fail_fast, on_done=step)
     truth, floor = to_table(tables.truth, TRUTH_COLUMNS), to_table(tables.floor, FLOOR_COLUMNS)
     write_csv(out / "ground_truth.csv", truth)
-    notes = [refused_note(truth)]
+    notes = [EXACT_NOTE if exact else refused_note(truth)]
     if len(floor):
         write_csv(out / "ground_truth_floor.csv", floor)
         notes.append(floor_note(floor))

@@ -167,9 +167,8 @@ def _run_frame(
     load: StageTime | None = None,
     on_scene: Callable[[Job, Scene, tuple[TubeEstimate, ...]], None] | None = None,
 ) -> None:
-    scene = prepare_scene(
-        frame, job.rack, job.tubes, detector_for(job.rack, job.tubes), config, job.hint, job.T_camera_rack
-    )
+    detector = detector_for(job.rack, job.tubes)
+    scene = prepare_scene(frame, job.rack, job.tubes, detector, config, job.hint, job.T_camera_rack, methods)
     keys = {"session": job.session, "trial": job.trial, "capture": frame.capture, "frame": frame.index}
     times = ([load] if load is not None else []) + list(scene.times)
     shown_method = DEFAULT_METHOD if DEFAULT_METHOD in methods else methods[0]

@@ -123,7 +123,7 @@ class RackConfig(_Section):
     max_stray_share: float = 0.08
     max_outside_share: float = 0.01
     max_stretch: float = 0.03
-    max_through_share: float = 0.3
+    max_through_share: float = 0.1
     min_seen: float = 0.1
     clear_seen: float = 0.25
     max_unseen_share: float = 0.4

@@ -13,7 +13,15 @@ import pandas as pd
 from scipy.spatial.transform import Rotation
 
 from tubepose.labware import TubeModel
-from tubepose.pose_errors import UPSIDE_DOWN_DEG, PoseErrors, add_s_mm, mssd_mm, pose_errors
+from tubepose.pose_errors import (
+    COVARIANCE_COLUMNS,
+    UPSIDE_DOWN_DEG,
+    PoseErrors,
+    add_s_mm,
+    mssd_mm,
+    pose_errors,
+    squared_mahalanobis,
+)
 from tubepose.statistics import DRAWS, paired_bootstrap
 from tubepose.transforms import FloatArray
 
@@ -23,7 +31,7 @@ AXES = ("rx_deg", "ry_deg", "tilt_deg", "tx_mm", "ty_mm", "tz_mm")
 ERROR_VALUES = (*AXES, "lateral_mm", "axial_mm", "cap_mm", "mssd_mm", "add_s_mm")
 ERROR_COLUMNS = (
     "session", "trial", "capture", "method", "seed", "slot", "tube", "outcome", "reason",
-    "tube_estimated", "type_correct", "score", *ERROR_VALUES,
+    "tube_estimated", "type_correct", "score", *ERROR_VALUES, "mahalanobis2",
 )  # fmt: skip
 COMPARISON_COLUMNS = (
     "method", "reference", "tube", "error", "mean_difference", "ci95_low", "ci95_high", "n_pairs", "n_captures",
@@ -58,9 +66,11 @@ def evaluate(
         Rows of errors.csv, columns ERROR_COLUMNS: outcome ``ok``, ``rejected`` (there is a pose, with its errors),
         ``missed`` (no estimate), ``failed`` (no pose, or upside down) or ``false``; errors as in `PoseErrors`.
     """
+    # Tables from before covariances were stated, and methods that state none.
+    estimates = estimates.assign(**{name: np.nan for name in COVARIANCE_COLUMNS if name not in estimates})
     judged = _judged(estimates, truth, methods)
     best = judged[judged["slot"].notna() & ~judged.duplicated(_MATCH)]
-    columns = [*_MATCH, "tube", "status", "reason", "score", *_POSE]
+    columns = [*_MATCH, "tube", "status", "reason", "score", *_POSE, *COVARIANCE_COLUMNS]
     rows = _expected(estimates, truth, judged, methods).merge(
         best[columns], how="left", on=_MATCH, suffixes=("", "_estimated"), validate="one_to_one"
     )
@@ -130,7 +140,17 @@ def _errors(rows: pd.DataFrame, tube_models: Mapping[str, TubeModel]) -> dict[st
         truth, estimate = T_camera_truth[of], T_camera_estimate[of]
         values["mssd_mm"][of] = mssd_mm(truth, estimate, profile_m)
         values["add_s_mm"][of] = add_s_mm(truth, estimate, profile_m)
+    values["mahalanobis2"] = squared_mahalanobis(T_camera_truth, T_camera_estimate, _covariances(rows))
     return values
+
+
+def _covariances(rows: pd.DataFrame) -> FloatArray:
+    """Covariances (N, 5, 5) from the columns of their upper half."""
+    covariance = np.empty((len(rows), 5, 5))
+    i, j = np.triu_indices(5)
+    covariance[:, i, j] = rows[list(COVARIANCE_COLUMNS)].to_numpy(dtype=float)
+    covariance[:, j, i] = covariance[:, i, j]
+    return covariance
 
 
 def _outcomes(rows: pd.DataFrame) -> tuple[list[str], list[str]]:
@@ -155,7 +175,9 @@ def _false_rows(judged: pd.DataFrame, truth: pd.DataFrame) -> pd.DataFrame:
     reasons = np.where(rows["truth_status"].notna(), "slot is taken", "slot holds no tube")
     reasons = np.where(rows["slot"].isna(), "stands in no slot", reasons)
     rows = rows.assign(outcome="false", reason=reasons, tube_estimated=rows["tube"], type_correct=None)
-    return rows.assign(**dict.fromkeys(ERROR_VALUES, np.nan)).sort_values([*_TRIAL, "method", "seed_key", "slot"])
+    return rows.assign(**dict.fromkeys((*ERROR_VALUES, "mahalanobis2"), np.nan)).sort_values(
+        [*_TRIAL, "method", "seed_key", "slot"]
+    )
 
 
 def _shape(rows: pd.DataFrame) -> pd.DataFrame:
@@ -163,7 +185,10 @@ def _shape(rows: pd.DataFrame) -> pd.DataFrame:
     seed = rows["seed_key"].astype("Int64").mask(rows["seed_key"] == _NO_SEED)
     table = rows.assign(seed=seed)[list(ERROR_COLUMNS)]
     texts = ["session", "trial", "capture", "method", "slot", "tube", "outcome", "reason", "tube_estimated"]
-    types: dict[str, Any] = {**dict.fromkeys(texts, "str"), **dict.fromkeys(("score", *ERROR_VALUES), "float64")}
+    types: dict[str, Any] = {
+        **dict.fromkeys(texts, "str"),
+        **dict.fromkeys(("score", *ERROR_VALUES, "mahalanobis2"), "float64"),
+    }
     return table.astype({**types, "seed": "Int64", "type_correct": "boolean"})
 
 

@@ -7,6 +7,9 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 
+import numpy as np
+from numpy.typing import NDArray
+
 from tubepose.baselines import fit_global_icp, fit_slot_icp, fit_upright
 from tubepose.capture.frame import CameraIntrinsics, RgbdFrame
 from tubepose.capture.registration import estimate_intrinsics
@@ -15,13 +18,14 @@ from tubepose.config import Config
 from tubepose.detection import Detection, Detector, rows_in_box
 from tubepose.labware import RackModel, TubeModel
 from tubepose.preprocessing import remove_outliers
+from tubepose.profile import ProfileTube, fit_profiles
 from tubepose.rack import RackPose, RackStatus, register_rack
 from tubepose.rivals import fit_gicp, fit_kiss_matcher
 from tubepose.slots import SlotAssignment, assign_slots, crop_to_slot, identify_tube
 from tubepose.transforms import FloatArray, invert_transform, transform_points
 from tubepose.tube import TubeMethod, TubePose, TubeStatus, fit_tube
 
-METHODS: Mapping[str, TubeMethod] = {
+TUBE_METHODS: Mapping[str, TubeMethod] = {
     "paper": fit_tube,
     "upright": fit_upright,
     "slot-icp": fit_slot_icp,
@@ -29,8 +33,11 @@ METHODS: Mapping[str, TubeMethod] = {
     "kiss-matcher": fit_kiss_matcher,
     "gicp": fit_gicp,
 }
+"""Methods that are asked for one tube at a time, with the points that a detector and its slot give it."""
+DEFAULT_METHOD = "profile"
+METHODS = (DEFAULT_METHOD, *TUBE_METHODS)
+"""All methods; `profile` looks at the whole frame, and finds its tubes and their slots itself."""
 STOCHASTIC = frozenset({"global-icp", "kiss-matcher"})
-DEFAULT_METHOD = "paper"
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,15 +64,15 @@ class TubeTarget:
     """A detected tube, ready for any method.
 
     Attributes:
-        detection: Index of the detection.
+        detection: Index of the detection; None for a tube that `profile` found itself.
         slot: Name of the slot, or None.
         tube: The tube's model, or None where its type is unknown.
-        share: Share of its projected hull in the slot's opening.
+        share: Share of its projected hull in the slot's opening; of `profile`, how much of its top was seen.
         reason: Why no method can be asked; empty otherwise.
-        points_m: Points after outlier removal, rack frame, shape (N, 3), metres.
+        points_m: Points, rack frame, shape (N, 3), metres.
     """
 
-    detection: int
+    detection: int | None
     slot: str | None
     tube: TubeModel | None
     share: float
@@ -80,6 +87,7 @@ class Scene:
     Attributes:
         frame: The frame.
         rack: The rack's model.
+        tubes: The kinds of tube that can stand in it.
         intrinsics: Recorded or, for an organised cloud, estimated from it; None where there are none.
         detections: All boxes.
         rack_pose: The rack's pose, or why there is none.
@@ -89,6 +97,7 @@ class Scene:
 
     frame: RgbdFrame
     rack: RackModel
+    tubes: tuple[TubeModel, ...]
     intrinsics: CameraIntrinsics | None
     detections: tuple[Detection, ...]
     rack_pose: RackPose
@@ -134,8 +143,9 @@ def prepare_scene(
     config: Config,
     hint: SlotHint | None = None,
     T_camera_rack: FloatArray | None = None,
+    methods: Sequence[str] = tuple(TUBE_METHODS),
 ) -> Scene:
-    """Detect, register the rack, and find the slot and the type of every tube.
+    """Detect, register the rack, and find the slot and the type of every detected tube.
 
     Args:
         frame: The frame.
@@ -145,6 +155,7 @@ def prepare_scene(
         config: All sections.
         hint: Which way round the rack stands, if known.
         T_camera_rack: The rack's pose where it is known; its registration is then left out.
+        methods: Methods that will be asked; slots of detected tubes are left out where none needs them.
     """
     clock = _Clock()
     intrinsics = frame.intrinsics
@@ -158,19 +169,23 @@ def prepare_scene(
         with clock.stage("rack"):
             rack_pose = _rack_pose(frame, rack, detections, config, hint, intrinsics)
     targets: tuple[TubeTarget, ...] = ()
-    if rack_pose.T_camera_rack is not None:
+    if rack_pose.T_camera_rack is not None and any(method in TUBE_METHODS for method in methods):
         with clock.stage("slots"):
             targets = _targets(frame, rack, tubes, detections, rack_pose.T_camera_rack, config)
-    return Scene(frame, rack, intrinsics, detections, rack_pose, targets, tuple(clock.times))
+    return Scene(frame, rack, tuple(tubes), intrinsics, detections, rack_pose, targets, tuple(clock.times))
 
 
 def estimate_tubes(
     scene: Scene, method: str, config: Config, seed: int | None = None
 ) -> tuple[tuple[TubeEstimate, ...], tuple[StageTime, ...]]:
-    """Ask one method for every detected tube of a scene."""
+    """Ask one method for every tube of a scene.
+
+    The time of `profile`, which does all tubes at once, is shared out evenly among them.
+    """
+    if method == DEFAULT_METHOD:
+        return _profile_estimates(scene, config)
     clock = _Clock()
     estimates = []
-    T_camera_rack = scene.rack_pose.T_camera_rack
     for target in scene.targets:
         if target.slot is None or target.tube is None:
             pose = TubePose(TubeStatus.REJECTED, target.reason, n_points=len(target.points_m))
@@ -178,12 +193,66 @@ def estimate_tubes(
             slot = scene.rack.slot(target.slot)
             with clock.stage("tube", method, target.slot, seed):
                 points_m = remove_outliers(target.points_m, config.preprocess)
-                pose = METHODS[method](points_m, slot, target.tube, scene.rack, config, seed or 0)
-        T_camera_tube = None
-        if pose.T_rack_tube is not None and T_camera_rack is not None:
-            T_camera_tube = T_camera_rack @ pose.T_rack_tube
-        estimates.append(TubeEstimate(method, seed, target, pose, T_camera_tube))
+                pose = TUBE_METHODS[method](points_m, slot, target.tube, scene.rack, config, seed or 0)
+        estimates.append(_estimate(scene, method, seed, target, pose))
     return tuple(estimates), tuple(clock.times)
+
+
+def _estimate(scene: Scene, method: str, seed: int | None, target: TubeTarget, pose: TubePose) -> TubeEstimate:
+    T_camera_rack = scene.rack_pose.T_camera_rack
+    known = pose.T_rack_tube is not None and T_camera_rack is not None
+    return TubeEstimate(method, seed, target, pose, T_camera_rack @ pose.T_rack_tube if known else None)
+
+
+def _profile_estimates(scene: Scene, config: Config) -> tuple[tuple[TubeEstimate, ...], tuple[StageTime, ...]]:
+    """The estimates of `profile`, and its time per tube."""
+    if scene.rack_pose.T_camera_rack is None:
+        return (), ()
+    start = time.perf_counter_ns()
+    found = fit_profiles(
+        scene.frame,
+        scene.intrinsics,
+        scene.rack_pose.T_camera_rack,
+        scene.rack,
+        scene.tubes,
+        config,
+        rack_covariance=scene.rack_pose.covariance,
+        allowed=allowed_types(scene),
+    )
+    share_ms = (time.perf_counter_ns() - start) / 1e6 / max(len(found), 1)
+    estimates = tuple(_estimate(scene, DEFAULT_METHOD, None, _profile_target(tube), tube.pose) for tube in found)
+    times = tuple(StageTime("tube", DEFAULT_METHOD, tube.slot or "", None, share_ms) for tube in found)
+    return estimates, times
+
+
+def _profile_target(tube: ProfileTube) -> TubeTarget:
+    reason = "" if tube.tube is not None else tube.pose.reason
+    return TubeTarget(None, tube.slot, tube.tube, tube.support, reason, tube.points_m)
+
+
+def allowed_types(scene: Scene) -> NDArray[np.bool_] | None:
+    """Which type may stand in which slot, shape (K, S), as far as a detector's classes say; None where they say nothing.
+
+    A box of a known class speaks for the slot whose tube's top, upright, is seen nearest to the box's middle.
+    """
+    T_camera_rack = scene.rack_pose.T_camera_rack
+    named = {word: k for k, tube in enumerate(scene.tubes) for word in (tube.name, *tube.classes)}
+    boxes = [box for box in scene.detections if box.class_name in named and np.isfinite(box.box_xyxy_px).all()]
+    if not boxes or scene.intrinsics is None or T_camera_rack is None:
+        return None
+    may = np.ones((len(scene.tubes), len(scene.rack.all_slots)), bool)
+    for box in boxes:
+        k = named[box.class_name]
+        top_m = np.column_stack(
+            [scene.rack.slot_centers_m, np.full(may.shape[1], scene.rack.floor_m + scene.tubes[k].height_m)]
+        )
+        pixels = scene.intrinsics.project(transform_points(T_camera_rack, top_m))
+        left, top, right, bottom = box.box_xyxy_px
+        distance = np.hypot(*(pixels - np.array([left + right, top + bottom]) / 2).T)
+        slot = int(np.argmin(distance))
+        if distance[slot] < max(right - left, bottom - top):
+            may[:, slot] = np.arange(len(scene.tubes)) == k
+    return may
 
 
 def _rack_pose(
@@ -238,10 +307,12 @@ __all__ = [
     "DEFAULT_METHOD",
     "METHODS",
     "STOCHASTIC",
+    "TUBE_METHODS",
     "Scene",
     "StageTime",
     "TubeEstimate",
     "TubeTarget",
+    "allowed_types",
     "estimate_tubes",
     "prepare_scene",
 ]

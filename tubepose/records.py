@@ -9,6 +9,7 @@ import numpy as np
 import pandas as pd
 
 from tubepose.pipeline import Scene, StageTime, TubeEstimate
+from tubepose.pose_errors import COVARIANCE_AXES, COVARIANCE_COLUMNS
 from tubepose.transforms import FloatArray, quaternion_wxyz, tilt_rad
 
 Row = dict[str, Any]
@@ -34,7 +35,7 @@ SLOT_COLUMNS = (
 )
 ESTIMATE_COLUMNS = (
     "session", "trial", "capture", "frame", "timestamp_ns", "method", "seed", "slot", "tube", "status", "reason",
-    "score", *POSE_COLUMNS, "tilt_deg", "inlier_rmse_m", "fitness", "n_points",
+    "score", *POSE_COLUMNS, "tilt_deg", "inlier_rmse_m", "fitness", "n_points", *COVARIANCE_COLUMNS,
 )  # fmt: skip
 TIMING_COLUMNS = (
     "session",
@@ -89,7 +90,8 @@ def slot_rows(keys: Row, method: str, scene: Scene, estimates: Sequence[TubeEsti
     """Rows of slots.csv, one per slot of the rack; none without the rack's pose."""
     if scene.rack_pose.T_camera_rack is None:
         return []
-    held = {estimate.target.slot: estimate for estimate in estimates if estimate.target.slot is not None}
+    # The first of a slot counts: what was found in it besides comes after it.
+    held = {estimate.target.slot: estimate for estimate in reversed(estimates) if estimate.target.slot is not None}
     rows = []
     for slot in scene.rack.all_slots:
         estimate = held.get(slot.name)
@@ -128,7 +130,16 @@ def estimate_row(keys: Row, scene: Scene, estimate: TubeEstimate) -> Row:
         "inlier_rmse_m": pose.inlier_rmse_m,
         "fitness": pose.fitness,
         "n_points": pose.n_points,
+        **covariance_columns(pose.covariance),
     }
+
+
+def covariance_columns(covariance: FloatArray | None) -> Row:
+    """The upper half of a pose's covariance (5, 5) as columns, rad and metres; NaN without one."""
+    if covariance is None:
+        return dict.fromkeys(COVARIANCE_COLUMNS, float("nan"))
+    half = covariance[np.triu_indices(len(COVARIANCE_AXES))]
+    return dict(zip(COVARIANCE_COLUMNS, map(float, half), strict=True))
 
 
 def timing_row(keys: Row, entry: StageTime, warmup: bool) -> Row:

@@ -128,6 +128,24 @@ def _errors(T_truth: FloatArray, T_measured: FloatArray, height_m: float) -> Row
     return {name: float(getattr(found, name)[0]) for name in FLOOR_COLUMNS[4:]}
 
 
+def exact_truth_rows(session: Session) -> list[Row]:
+    """The exact poses of a simulated session as rows of ground_truth.csv: every declared tube, none refused.
+
+    Raises:
+        ConfigError: The session is recorded.
+    """
+    if session.origin != "simulated":
+        raise ConfigError(f"session {session.name} is recorded: only simulated ones know exact poses")
+    rows = []
+    for trial in session.trials:
+        exact = read_exact_truth(session.folder, trial.name)
+        keys: Row = {"session": session.name, "trial": trial.name, "capture": "", "status": "ok", "reason": "exact"}
+        for slot, name in trial.tubes.items():
+            T_camera_tube = exact.tubes[slot][1]
+            rows.append({**keys, "slot": slot, "tube": session.tubes[name].name, **pose_columns(T_camera_tube)})
+    return rows
+
+
 def with_exact_rack(jobs: Sequence[Job], session: Session) -> list[Job]:
     """The jobs of a simulated session with the rack's exact pose, to tell the rack's error from the tubes'.
 

@@ -37,6 +37,8 @@ class TubePose:
         inlier_rmse_m: RMS of the method's own residual, metres; NaN where it has none.
         fitness: Share of the points that the pose explains; NaN where the method does not say.
         n_points: Points that the fit saw.
+        covariance: Of the pose, shape (5, 5), over small turns about the tube's x and y and shifts along its x, y and z
+            at its bottom, rad and metres; None where the method does not say.
     """
 
     status: TubeStatus
@@ -46,6 +48,7 @@ class TubePose:
     inlier_rmse_m: float = float("nan")
     fitness: float = float("nan")
     n_points: int = 0
+    covariance: FloatArray | None = None
 
 
 class TubeMethod(Protocol):

@@ -1,0 +1,5 @@
+"""The default estimator: tubes from their whole profile and their slots, all of a frame at once (docs/method.md)."""
+
+from tubepose.profile.estimate import ProfileTube, fit_profiles
+
+__all__ = ["ProfileTube", "fit_profiles"]

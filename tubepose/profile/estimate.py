@@ -1,0 +1,226 @@
+"""The estimator `profile`: every tube of a frame at once, from its top, its wall and its slot (docs/method.md)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tubepose.capture.frame import CameraIntrinsics, RgbdFrame
+from tubepose.config import Config, ProfileConfig
+from tubepose.labware import RackModel, TubeModel
+from tubepose.profile.leftovers import Leftover, find_leftovers
+from tubepose.profile.measure import Measured, measure_tops
+from tubepose.profile.posterior import Evidence, Posterior, combine, evidence, pivot_m
+from tubepose.profile.verdict import rejection, score
+from tubepose.profile.wall import wall_evidence
+from tubepose.transforms import FloatArray, axis_rotation, make_transform
+from tubepose.tube import TubePose, TubeStatus
+
+WALL_ROUNDS = 2
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ProfileTube:
+    """One tube, or something that looks like none.
+
+    Attributes:
+        slot: Name of its slot, or None where it stands in none.
+        tube: Its type, or None where it is unknown.
+        support: Share of its top that was seen less that of its surroundings, 0 to 1; NaN where it has no top.
+        points_m: Its points, rack frame, shape (N, 3), metres.
+        pose: Its pose in the rack frame, with covariance; or why there is none.
+    """
+
+    slot: str | None
+    tube: TubeModel | None
+    support: float
+    points_m: FloatArray
+    pose: TubePose
+
+
+def fit_profiles(
+    frame: RgbdFrame,
+    intrinsics: CameraIntrinsics | None,
+    T_camera_rack: FloatArray,
+    rack: RackModel,
+    tubes: Sequence[TubeModel],
+    config: Config,
+    *,
+    rack_covariance: FloatArray | None = None,
+    allowed: NDArray[np.bool_] | None = None,
+) -> tuple[ProfileTube, ...]:
+    """Poses of all tubes of a frame.
+
+    Args:
+        frame: The frame.
+        intrinsics: Of its image, where there is one.
+        T_camera_rack: The rack's pose, shape (4, 4), metres.
+        rack: The rack.
+        tubes: Types that can stand in it.
+        config: Sections profile and slots are used.
+        rack_covariance: Of the rack's pose, shape (6, 6), as `RackPose.covariance`; None counts as exact.
+        allowed: Which type may stand in which slot, shape (K, S), where a detector says; all by default.
+
+    Returns:
+        Tubes by slot, then what is left over.
+    """
+    if not tubes:
+        return ()
+    measured = measure_tops(frame, intrinsics, T_camera_rack, rack, tubes, config, allowed)
+    models = [tubes[k] for k in measured.tops.tube]
+    leftovers = find_leftovers(measured.points, measured.label, measured.tops.slot.tolist(), rack, tubes)
+    posterior = fuse(measured, models, rack, config.profile)
+    covariance = pose_covariance(posterior, measured, models, rack, config.profile, rack_covariance)
+    rise = _rise_m(measured, models, rack, config.profile)
+    counts = np.bincount(measured.label[measured.label >= 0], minlength=len(models))
+    order = np.argsort(measured.label, kind="stable")
+    ends = np.cumsum(counts) + np.count_nonzero(measured.label < 0)
+    found = []
+    for i, tube in enumerate(models):
+        slot = rack.all_slots[measured.tops.slot[i]]
+        points_m = measured.points.points_m[order[ends[i] - counts[i] : ends[i]]]
+        pose = _pose(i, measured, posterior, covariance[i], float(rise[i]), tube, rack, config.profile)
+        crowd = next((left.reason for left in leftovers if left.slot == measured.tops.slot[i]), "")
+        if crowd and pose.status is TubeStatus.OK:
+            pose = _rejected(pose, f"two tubes in one slot: {crowd}")
+        found.append(ProfileTube(slot.name, tube, float(measured.tops.support[i]), points_m, pose))
+    return (*found, *(_no_tube(left, measured, rack) for left in leftovers))
+
+
+def fuse(measured: Measured, models: Sequence[TubeModel], rack: RackModel, config: ProfileConfig) -> Posterior:
+    """Axes from tops, slots and walls; the walls' points are looked up again where the axis has moved to."""
+    slots = [rack.all_slots[i] for i in measured.tops.slot]
+    centers = rack.slot_centers_m[measured.tops.slot]
+    tops = top_evidence(measured, models, rack, config)
+    found = combine(tops, slots, models, rack, config)
+    for _ in range(WALL_ROUNDS):
+        walls = wall_evidence(measured.points, measured.label, found.mean, centers, models, rack, config)
+        found = combine(tops + walls, slots, models, rack, config)
+    return found
+
+
+def top_evidence(measured: Measured, models: Sequence[TubeModel], rack: RackModel, config: ProfileConfig) -> Evidence:
+    """What tops say of axes: the axis goes through the circle's middle and, but for the cap's seat, along the normal."""
+    count = len(models)
+    centers = rack.slot_centers_m[measured.tops.slot]
+    lever = measured.level_m - rack.floor_m - np.array([pivot_m(tube) for tube in models])
+    through = np.zeros((count, 2, 4))
+    through[:, [0, 1], [0, 1]] = 1.0
+    through[:, [0, 1], [2, 3]] = lever[:, None]
+    along = np.zeros((count, 2, 4))
+    along[:, [0, 1], [2, 3]] = 1.0
+    variance = measured.planes.slope_var + config.cap_tilt_rad**2
+    return evidence(through, measured.center_m - centers, measured.circles.covariance_m2) + evidence(
+        along, -measured.planes.slope, variance[:, None, None] * np.eye(2)
+    )
+
+
+def _rise_m(measured: Measured, models: Sequence[TubeModel], rack: RackModel, config: ProfileConfig) -> FloatArray:
+    """How far each tube stands above the slot's floor, shape (T,), metres: the floor's height and a closed top's, weighed."""
+    expected = rack.floor_m + np.array([tube.height_m for tube in models])
+    seen = np.nan_to_num(measured.planes.height_m - expected)
+    return np.asarray(seen * _rise_gain(measured, rack, config))
+
+
+def _rise_gain(measured: Measured, rack: RackModel, config: ProfileConfig) -> FloatArray:
+    """Weight of a top's height against the floor's, shape (T,): 0 for open tops, whose light comes from below them."""
+    floor2 = (rack.floor_tolerance_mm * 1e-3) ** 2
+    gain = floor2 / (floor2 + config.cap_height_m**2)
+    return np.where(np.isfinite(measured.planes.height_m), gain, 0.0)
+
+
+def pose_covariance(
+    posterior: Posterior,
+    measured: Measured,
+    models: Sequence[TubeModel],
+    rack: RackModel,
+    config: ProfileConfig,
+    rack_covariance: FloatArray | None,
+) -> FloatArray:
+    """Covariance of poses over (rotation about x, about y; translation along x, y, z), shape (T, 5, 5), rad and metres.
+
+    The axes are the tube's own at its bottom. The rack's error moves the floor and not what was seen of the top: it
+    shifts the bottom, and turns the axis by that shift over the distance between them.
+    """
+    count = len(models)
+    held = np.array([pivot_m(tube) for tube in models])
+    height = np.array([tube.height_m for tube in models])
+    J = np.zeros((count, 5, 4))
+    J[:, 0, 3], J[:, 1, 2] = -1.0, 1.0
+    J[:, [2, 3], [0, 1]] = 1.0
+    J[:, [2, 3], [2, 3]] = -held[:, None]
+    covariance = np.einsum("tij,tjk,tlk->til", J, posterior.covariance, J)
+    covariance[:, 4, 4] += (1 - _rise_gain(measured, rack, config)) * (rack.floor_tolerance_mm * 1e-3) ** 2
+    if rack_covariance is None:
+        return np.asarray(covariance)
+    arm = np.column_stack([rack.slot_centers_m[measured.tops.slot], np.full(count, rack.floor_m - rack.height_m)])
+    moved = np.zeros((count, 3, 6))
+    moved[:, :, 3:] = np.eye(3)
+    moved[:, 0, 1], moved[:, 0, 2] = arm[:, 2], -arm[:, 1]
+    moved[:, 1, 0], moved[:, 1, 2] = -arm[:, 2], arm[:, 0]
+    moved[:, 2, 0], moved[:, 2, 1] = arm[:, 1], -arm[:, 0]
+    K = np.zeros((count, 5, 3))
+    K[:, 0, 1], K[:, 1, 0] = 1 / height, -1 / height
+    K[:, [2, 3, 4], [0, 1, 2]] = 1.0
+    chain = np.einsum("tij,tjk->tik", K, moved)
+    return np.asarray(covariance + np.einsum("tij,jk,tlk->til", chain, rack_covariance, chain))
+
+
+def _pose(
+    i: int,
+    measured: Measured,
+    posterior: Posterior,
+    covariance: FloatArray,
+    rise_m: float,
+    tube: TubeModel,
+    rack: RackModel,
+    config: ProfileConfig,
+) -> TubePose:
+    """Pose and verdict of one tube."""
+    u, v, a, b = posterior.mean[i]
+    slot = rack.all_slots[measured.tops.slot[i]]
+    axis = np.array([a, b, 1.0]) / np.sqrt(1 + a * a + b * b)
+    held = pivot_m(tube)
+    bottom = np.array([*(slot.center_m + (u, v)), rack.floor_m + held + rise_m]) - held * axis
+    tilt_std = float(np.sqrt(np.trace(covariance[:2, :2])))
+    high = float(measured.planes.height_m[i] - rack.floor_m - tube.height_m)
+    sectors, allowed = float(measured.circles.sectors[i]), float(posterior.allowed[i])
+    reason = rejection(
+        sectors=sectors, allowed=allowed, high_m=high, tilt_std_rad=tilt_std, tube=tube, rack=rack, slot=slot.name,
+        config=config,
+    )  # fmt: skip
+    return TubePose(
+        TubeStatus.REJECTED if reason else TubeStatus.OK,
+        reason,
+        make_transform(axis_rotation(axis), bottom),
+        score=score(tilt_std, sectors, allowed, config),
+        inlier_rmse_m=float(measured.planes.rms_m[i]),
+        fitness=sectors,
+        n_points=int(np.count_nonzero(measured.label == i)),
+        covariance=covariance,
+    )
+
+
+def _rejected(pose: TubePose, reason: str) -> TubePose:
+    return TubePose(
+        TubeStatus.REJECTED,
+        reason,
+        pose.T_rack_tube,
+        pose.score,
+        pose.inlier_rmse_m,
+        pose.fitness,
+        pose.n_points,
+        pose.covariance,
+    )
+
+
+def _no_tube(left: Leftover, measured: Measured, rack: RackModel) -> ProfileTube:
+    """What is left over, as a tube without a pose."""
+    points_m = measured.points.points_m[left.rows]
+    slot = rack.all_slots[left.slot].name if left.slot is not None else None
+    return ProfileTube(
+        slot, None, float("nan"), points_m, TubePose(TubeStatus.REJECTED, left.reason, n_points=len(points_m))
+    )

@@ -1,0 +1,114 @@
+"""What stands or lies on a rack and is no tube that is looked for: unknown types, tubes across the rack, second tubes."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from tubepose.labware import RackModel, TubeModel
+from tubepose.profile.standing import OUTSIDE_M, Standing
+from tubepose.transforms import FloatArray
+
+CELL_M = 1.0e-3
+CORE_SHARE = 0.6
+"""Least filled share of a slot's middle for something to stand in it."""
+LYING_PITCHES = 1.6
+"""Something longer than this many pitches stands in no slot."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Leftover:
+    """Something that is no known tube.
+
+    Attributes:
+        slot: Index of the slot that it stands in, or None.
+        reason: What it looks like, in words.
+        rows: Rows of the standing points that it is made of.
+    """
+
+    slot: int | None
+    reason: str
+    rows: NDArray[np.intp]
+
+
+def find_leftovers(
+    standing: Standing, label: NDArray[np.intp], taken: Sequence[int], rack: RackModel, tubes: Sequence[TubeModel]
+) -> tuple[Leftover, ...]:
+    """Groups of points that belong to no top and fill the middle of a slot, or lie across several.
+
+    Light that went through a wall leaves points too, but thin ones: a group must be solid where it is judged.
+
+    Args:
+        standing: Points above the rack's top.
+        label: Tube of each point, -1 for none.
+        taken: Slots that hold a tube.
+        rack: The rack.
+        tubes: The types that were looked for.
+    """
+    rest = np.flatnonzero(label < 0)
+    if len(rest) == 0:
+        return ()
+    half = rack.outline_m / 2 + OUTSIDE_M
+    cells = np.rint((standing.points_m[rest, :2] + half) / CELL_M).astype(np.intp)
+    picture = np.zeros(np.ceil(2 * half / CELL_M).astype(int) + 2, np.uint8)
+    picture[cells[:, 0], cells[:, 1]] = 1
+    # Close the gaps of coarse scans, then drop what is thinner than 5 mm: walls' ghosts, slivers beside tops.
+    solid = cv2.morphologyEx(picture, cv2.MORPH_CLOSE, np.ones((3, 3), np.uint8))
+    solid = cv2.morphologyEx(solid, cv2.MORPH_OPEN, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (5, 5)))
+    count, groups = cv2.connectedComponents(solid)
+    of = groups[cells[:, 0], cells[:, 1]]
+    pitch = _pitch_m(rack)
+    found: list[Leftover] = []
+    for group in range(1, count):
+        rows = rest[of == group]
+        if len(rows):
+            entry = _judge(standing, rows, np.argwhere(groups == group), half, pitch, taken, rack, tubes)
+            found += [entry] if entry is not None else []
+    return tuple(found)
+
+
+def _judge(
+    standing: Standing,
+    rows: NDArray[np.intp],
+    cells: NDArray[np.intp],
+    half: FloatArray,
+    pitch_m: float,
+    taken: Sequence[int],
+    rack: RackModel,
+    tubes: Sequence[TubeModel],
+) -> Leftover | None:
+    """What one group is; None if it is too small to be anything."""
+    (_, _), sides, _ = cv2.minAreaRect(cells.astype(np.float32))
+    length_m, width_m = max(sides) * CELL_M, min(sides) * CELL_M
+    height_m = float(np.percentile(standing.points_m[rows, 2], 95)) - rack.floor_m
+    if length_m > LYING_PITCHES * pitch_m and width_m > 6e-3:
+        return Leftover(
+            None, f"lies across the rack: {length_m * 1e3:.0f} x {width_m * 1e3:.0f} mm seen from above", rows
+        )
+    place_m = cells.mean(axis=0) * CELL_M - half
+    distance = np.linalg.norm(rack.slot_centers_m - place_m, axis=1)
+    slot = int(distance.argmin())
+    area_m2 = len(cells) * CELL_M**2
+    if area_m2 < CORE_SHARE * np.pi * (0.3 * pitch_m) ** 2 or distance[slot] > 0.6 * pitch_m:
+        return None
+    if slot in taken:
+        if area_m2 < np.pi * (0.3 * pitch_m) ** 2:
+            return None
+        return Leftover(slot, f"a second top in slot {rack.all_slots[slot].name}, {height_m * 1e3:.1f} mm high", rows)
+    heights = ", ".join(f"{tube.name} {tube.height_mm:g}" for tube in tubes)
+    return Leftover(
+        slot, f"unknown type: {height_m * 1e3:.1f} mm high, expected (mm): {heights}; or it stands on something", rows
+    )
+
+
+def _pitch_m(rack: RackModel) -> float:
+    """Distance of the two nearest slots, metres; 20 mm for a lone slot."""
+    centers = rack.slot_centers_m
+    if len(centers) == 1:
+        return 0.02
+    apart = np.linalg.norm(centers[:, None] - centers[None], axis=2) + np.eye(len(centers))
+    return float(apart.min())

@@ -1,0 +1,176 @@
+"""Measurements of the tops of all tubes of a frame: which they are, where their circles are, how their planes lie."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from tubepose.capture.frame import CameraIntrinsics, RgbdFrame
+from tubepose.config import Config, ProfileConfig
+from tubepose.labware import RackModel, TubeModel
+from tubepose.profile.outline import NORMALS, Circles, fit_discs, unknown_circles
+from tubepose.profile.plane import TopPlanes, fit_top_planes
+from tubepose.profile.rims import fit_rims
+from tubepose.profile.standing import Standing, gather_standing
+from tubepose.profile.tops import Tops, find_tops, mouth_radius_m, top_level_m, top_radius_m
+from tubepose.transforms import FloatArray
+
+TALLER_M = 0.02
+"""Something that stands on something else is looked for this far above the tallest tube."""
+ON_PLANE_M = 5.0e-4
+DISC_GAP_M = 0.9e-3
+RIM_GAP_M = 0.6e-3
+"""Where another top is nearer than this, the end of a disc (the ring of a rim) is not told from the other's."""
+NEAR_TOP_M = 2.5e-3
+"""Points this far outside of a top can be of the wall below it."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Measured:
+    """Measurements of tops, T tubes.
+
+    Attributes:
+        tops: Where they were found.
+        center_m: Middle of each top's circle, rack frame, shape (T, 2), metres.
+        level_m: Height of that circle above the rack's base, shape (T,), metres.
+        planes: Planes of closed tops; NaN for open ones.
+        circles: Circles of all tops.
+        label: Tube of each point, shape (N,), -1 for none.
+        points: The points.
+    """
+
+    tops: Tops
+    center_m: FloatArray
+    level_m: FloatArray
+    planes: TopPlanes
+    circles: Circles
+    label: NDArray[np.intp]
+    points: Standing
+
+
+def measure_tops(
+    frame: RgbdFrame,
+    intrinsics: CameraIntrinsics | None,
+    T_camera_rack: FloatArray,
+    rack: RackModel,
+    tubes: Sequence[TubeModel],
+    config: Config,
+    allowed: NDArray[np.bool_] | None = None,
+) -> Measured:
+    """Find and measure the tops of all tubes in a rack.
+
+    Args:
+        frame: The frame.
+        intrinsics: Of its image; without them rims are not measured.
+        T_camera_rack: The rack's pose, shape (4, 4), metres.
+        rack: The rack.
+        tubes: Candidate types, at least one.
+        config: Sections profile and slots are used.
+        allowed: Which type may stand in which slot, shape (K, S); all by default.
+    """
+    tallest = max(tube.height_m for tube in tubes)
+    standing = gather_standing(
+        frame,
+        intrinsics,
+        T_camera_rack,
+        rack,
+        rack.height_m + config.slots.clearance_m,
+        rack.floor_m + tallest + TALLER_M,
+    )
+    tops = find_tops(standing, rack, tubes, config.profile, allowed)
+    shape = _shapes(tops, tubes, rack)
+    rims = _measure_rims(frame, intrinsics, T_camera_rack, tops, shape, config.profile)
+    kept = ~shape.open | (rims.sectors >= config.profile.min_rim_sectors) | (tops.support >= config.profile.min_support)
+    tops, shape, rims = tops.take(kept), shape.take(kept), rims.take(kept)
+    label = label_points(standing, tops.center_m, shape.radius_m)
+    planes, discs = _measure_closed(standing, label, tops, shape, config.profile)
+    circles = discs.where(~shape.open, rims)
+    level = np.where(np.isfinite(planes.height_m), planes.height_m, shape.level_m)
+    return Measured(tops, tops.center_m + circles.offset_m, level, planes, circles, label, standing)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Shapes:
+    """What the definitions say of the tops, T of them: outer and inner radius, expected height, whether open."""
+
+    radius_m: FloatArray
+    mouth_m: FloatArray
+    level_m: FloatArray
+    open: NDArray[np.bool_]
+
+    def take(self, keep: NDArray[np.bool_]) -> _Shapes:
+        return _Shapes(self.radius_m[keep], self.mouth_m[keep], self.level_m[keep], self.open[keep])
+
+
+def _shapes(tops: Tops, tubes: Sequence[TubeModel], rack: RackModel) -> _Shapes:
+    of_type = np.array([[top_radius_m(t), mouth_radius_m(t), top_level_m(t, rack), t.is_open] for t in tubes])[
+        tops.tube
+    ]
+    return _Shapes(of_type[:, 0], of_type[:, 1], of_type[:, 2], of_type[:, 3] > 0)
+
+
+def _measure_rims(
+    frame: RgbdFrame,
+    intrinsics: CameraIntrinsics | None,
+    T_camera_rack: FloatArray,
+    tops: Tops,
+    shape: _Shapes,
+    config: ProfileConfig,
+) -> Circles:
+    """Circles of the open tops; unknown for the others, and for all without pixels."""
+    circles = unknown_circles(len(shape.open))
+    at = np.flatnonzero(shape.open)
+    if len(at) == 0 or intrinsics is None or not frame.organised:
+        return circles
+    radii = np.column_stack([shape.mouth_m, shape.radius_m])[at]
+    sure = tops.support >= config.min_support
+    blocked = blocked_sectors(tops.center_m, shape.radius_m, RIM_GAP_M, sure)[at]
+    rims = fit_rims(frame, intrinsics, T_camera_rack, tops.center_m[at], shape.level_m[at], radii, blocked, config)
+    return circles.put(at, rims)
+
+
+def label_points(standing: Standing, center_m: FloatArray, radius_m: FloatArray) -> NDArray[np.intp]:
+    """Tube whose top is nearest to each point from above, shape (N,); -1 farther than `NEAR_TOP_M` from all."""
+    if len(center_m) == 0:
+        return np.full(len(standing.points_m), -1)
+    distance, nearest = cKDTree(center_m).query(
+        standing.points_m[:, :2], distance_upper_bound=radius_m.max() + NEAR_TOP_M
+    )
+    found = np.isfinite(distance)
+    label = np.where(found, nearest, 0)
+    return np.where(found & (distance < radius_m[label] + NEAR_TOP_M), label, -1)
+
+
+def blocked_sectors(
+    center_m: FloatArray, radius_m: FloatArray, gap_m: float, sure: NDArray[np.bool_] | None = None
+) -> NDArray[np.bool_]:
+    """Sectors of every top whose end is nearer than a gap to another top, shape (T, SECTORS).
+
+    Only tops that are `sure`, shape (T,), block others; all by default.
+    """
+    edge = center_m[:, None, :] + radius_m[:, None, None] * NORMALS[None]
+    gap = np.linalg.norm(edge[:, :, None] - center_m[None, None], axis=-1) - radius_m[None, None, :]
+    gap[np.arange(len(radius_m)), :, np.arange(len(radius_m))] = np.inf
+    if sure is not None:
+        gap[:, :, ~sure] = np.inf
+    return np.asarray(gap.min(axis=2, initial=np.inf) < gap_m)
+
+
+def _measure_closed(
+    standing: Standing, label: NDArray[np.intp], tops: Tops, shape: _Shapes, config: ProfileConfig
+) -> tuple[TopPlanes, Circles]:
+    """Planes and circles of the closed tops; unknown for the others."""
+    mine = np.flatnonzero((label >= 0) & ~np.append(shape.open, True)[label])
+    points, of = standing.take(mine), label[mine]
+    offset = points.points_m[:, :2] - tops.center_m[of]
+    planes = fit_top_planes(of, offset, points.points_m[:, 2], shape.level_m, shape.radius_m, config)
+    height = planes.height_at(of, offset)
+    with np.errstate(invalid="ignore"):
+        on = np.flatnonzero(np.abs(points.points_m[:, 2] - height) < ON_PLANE_M)
+    flat = points.take(on).on_level(height[on]) - tops.center_m[of[on]]
+    blocked = blocked_sectors(tops.center_m, shape.radius_m, DISC_GAP_M)
+    return planes, fit_discs(of[on], flat, shape.radius_m, blocked, config)

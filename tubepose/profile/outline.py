@@ -1,0 +1,161 @@
+"""Middle of every top's circle, from where it ends: in sectors around it, all tubes at once.
+
+A closed top is a disc of points with its depth; a rim is a bright ring in the image, whatever its depth says. Each
+sector of the circle gives the radius at which it ends (or at which the ring is brightest), and the circle's offset and
+widening follow by robust least squares: radius_s = R + widening + offset . n_s + ellipse cos(2 phi) + ...
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tubepose.config import ProfileConfig
+from tubepose.transforms import FloatArray
+
+SECTORS = 24
+ANGLES = (np.arange(SECTORS) + 0.5) / SECTORS * 2 * np.pi - np.pi
+NORMALS: FloatArray = np.column_stack([np.cos(ANGLES), np.sin(ANGLES)])
+WIDTHS_M = ((2.5e-3, 2.0e-3), (1.2e-3, 1.2e-3), (0.8e-3, 0.9e-3))
+"""How far inside and outside of the circle a sector's end is looked for, round by round."""
+DENSITY_BAND_M = 1.5e-3
+"""The ring inside of that, where the density of points is taken from."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Circles:
+    """Circles of tops, one per tube.
+
+    Attributes:
+        offset_m: From the centre that was given to the circle's, shape (T, 2), metres; NaN where it is not seen.
+        covariance_m2: Of the offset, shape (T, 2, 2).
+        widening_m: How much larger than its definition the circle is, shape (T,), metres.
+        sectors: Share of the sectors that count, shape (T,).
+    """
+
+    offset_m: FloatArray
+    covariance_m2: FloatArray
+    widening_m: FloatArray
+    sectors: FloatArray
+
+    def take(self, keep: NDArray[np.bool_] | NDArray[np.intp]) -> Circles:
+        """The same of some of the tubes."""
+        return Circles(self.offset_m[keep], self.covariance_m2[keep], self.widening_m[keep], self.sectors[keep])
+
+    def where(self, mine: NDArray[np.bool_], other: Circles) -> Circles:
+        """These circles where `mine`, shape (T,), is True, the other's elsewhere."""
+        return Circles(
+            np.where(mine[:, None], self.offset_m, other.offset_m),
+            np.where(mine[:, None, None], self.covariance_m2, other.covariance_m2),
+            np.where(mine, self.widening_m, other.widening_m),
+            np.where(mine, self.sectors, other.sectors),
+        )
+
+    def put(self, at: NDArray[np.intp], other: Circles) -> Circles:
+        """These circles with those at some places taken from another, in its order."""
+        order = np.zeros(len(self.sectors), np.intp)
+        order[at] = np.arange(len(at))
+        chosen = np.zeros(len(self.sectors), bool)
+        chosen[at] = True
+        return other.take(order).where(chosen, self) if len(at) else self
+
+
+def unknown_circles(count: int) -> Circles:
+    """Circles that nothing is known of."""
+    return Circles(
+        np.full((count, 2), np.nan), np.tile(np.eye(2), (count, 1, 1)), np.full(count, np.nan), np.zeros(count)
+    )
+
+
+def fit_discs(
+    label: NDArray[np.intp],
+    offset_m: FloatArray,
+    radius_m: FloatArray,
+    blocked: NDArray[np.bool_],
+    config: ProfileConfig,
+) -> Circles:
+    """Middle of discs that are full of points.
+
+    Args:
+        label: Tube of each point of a top, shape (N,).
+        offset_m: Its offset from the centre assumed so far, in the top's plane, shape (N, 2), metres.
+        radius_m: Radius of each disc, shape (T,).
+        blocked: Sectors where another top is so near that the end is not seen, shape (T, SECTORS).
+        config: Noise of outlines.
+    """
+    count = len(radius_m)
+    shift = np.zeros((count, 2))
+    circles = None
+    for inside_m, outside_m in WIDTHS_M:
+        end_m, seen = _sector_ends(label, offset_m - shift[label], radius_m, inside_m, outside_m)
+        circles = fit_circles(
+            end_m - radius_m[:, None], seen & ~blocked, config, config.outline_noise_m, config.outline_bias_m
+        )
+        shift += np.nan_to_num(circles.offset_m)
+    assert circles is not None
+    return Circles(
+        np.where(np.isfinite(circles.offset_m), shift, np.nan),
+        circles.covariance_m2,
+        circles.widening_m,
+        circles.sectors,
+    )
+
+
+def _sector_ends(
+    label: NDArray[np.intp], offset_m: FloatArray, radius_m: FloatArray, inside_m: float, outside_m: float
+) -> tuple[FloatArray, NDArray[np.bool_]]:
+    """Radius at which each sector ends, shape (T, SECTORS), metres, and whether it is filled up to there.
+
+    The end is where the points of the sector would end if they lay as dense as those further in.
+    """
+    count = len(radius_m)
+    rho = np.hypot(*offset_m.T)
+    sector = ((np.arctan2(offset_m[:, 1], offset_m[:, 0]) + np.pi) / (2 * np.pi) * SECTORS).astype(np.intp) % SECTORS
+    place = label * SECTORS + sector
+    low = radius_m - inside_m
+    lower = low - DENSITY_BAND_M
+    r, lo, lr = rho, low[label], lower[label]
+    core = np.bincount(place[(r > lr) & (r <= lo)], minlength=count * SECTORS).reshape(count, SECTORS)
+    edge = (r > lo) & (r <= (radius_m + outside_m)[label])
+    counted = np.bincount(place[edge], minlength=count * SECTORS).reshape(count, SECTORS)
+    width = 2 * np.pi / SECTORS
+    core_area = 0.5 * width * (low**2 - lower**2)
+    density = np.median(core, axis=1) / core_area
+    with np.errstate(divide="ignore", invalid="ignore"):
+        end = np.sqrt(low[:, None] ** 2 + 2 * counted / (width * density[:, None]))
+        seen = (core > 0.8 * (density * core_area)[:, None]) & (density * core_area > 3)[:, None]
+    return np.where(seen, end, np.nan), seen
+
+
+def fit_circles(
+    excess_m: FloatArray, seen: NDArray[np.bool_], config: ProfileConfig, sigma: float, bias_m: float
+) -> Circles:
+    """Offset and widening of circles from the excess radius of their sectors, shape (T, SECTORS), metres.
+
+    A projector at one side blurs a circle's ends less along the baseline than across it, which looks like an ellipse:
+    two more unknowns with a prior. Weights are Huber's.
+    """
+    design = np.column_stack([NORMALS, np.ones(SECTORS), np.cos(2 * ANGLES), np.sin(2 * ANGLES)])
+    prior = np.diag([0.0, 0.0, 1 / config.widening_m**2, 1 / config.widening_m**2, 1 / config.widening_m**2])
+    value = np.where(seen, excess_m, 0.0)
+    weight = seen / sigma**2
+    solution = np.zeros((len(excess_m), 5))
+    normal = np.tile(np.eye(5), (len(excess_m), 1, 1))
+    usable = seen.sum(axis=1) >= SECTORS // 4
+    for _ in range(6):
+        normal = np.einsum("ts,si,sj->tij", weight, design, design) + prior
+        normal[~usable] = np.eye(5)
+        right = (weight * value) @ design
+        solution = np.linalg.solve(normal, right[..., None])[..., 0]
+        residual = np.abs(value - solution @ design.T)
+        weight = seen / sigma**2 * np.minimum(1.0, 1.5 * sigma / np.maximum(residual, 1e-9))
+    covariance = np.linalg.inv(normal)[:, :2, :2]
+    usable &= np.trace(covariance, axis1=1, axis2=2) < (0.5e-3) ** 2
+    return Circles(
+        np.where(usable[:, None], solution[:, :2], np.nan),
+        covariance + np.eye(2) * bias_m**2,
+        solution[:, 2],
+        (seen.sum(axis=1) / SECTORS),
+    )

@@ -1,0 +1,124 @@
+"""The plane of every closed cap's top: which way it faces, and how high it is."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tubepose.config import ProfileConfig
+from tubepose.transforms import FloatArray
+
+ROUNDS = 5
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TopPlanes:
+    """Planes z = height + slope (xy - center), one per tube, shape (T, ...), rack frame.
+
+    Attributes:
+        height_m: Height of the plane above the rack's base at the given centre, shape (T,), metres; NaN without one.
+        slope: Its rise along x and y, shape (T, 2).
+        slope_var: Variance of each slope, shape (T,).
+        rms_m: RMS distance of the points that count, shape (T,), metres.
+        n_points: Points that count, shape (T,).
+    """
+
+    height_m: FloatArray
+    slope: FloatArray
+    slope_var: FloatArray
+    rms_m: FloatArray
+    n_points: NDArray[np.intp]
+
+    def height_at(self, label: NDArray[np.intp], offset_m: FloatArray) -> FloatArray:
+        """Height of each point's plane at its offset (N, 2) from its tube's centre, shape (N,), metres."""
+        return np.asarray(self.height_m[label] + np.einsum("ij,ij->i", self.slope[label], offset_m))
+
+
+def fit_top_planes(
+    label: NDArray[np.intp],
+    offset_m: FloatArray,
+    height_m: FloatArray,
+    expected_m: FloatArray,
+    radius_m: FloatArray,
+    config: ProfileConfig,
+) -> TopPlanes:
+    """Fit the planes of all tops at once: least squares with Tukey's weights, from the median height.
+
+    The variance of a slope has two parts: the noise of single points, which many points average out, and the error
+    that points within `shared_error_reach_m` share, which they do not.
+
+    Args:
+        label: Tube of each point, shape (N,).
+        offset_m: Offset of each point from its tube's centre, shape (N, 2), metres.
+        height_m: Height of each point above the rack's base, shape (N,).
+        expected_m: Height at which each top is expected, shape (T,).
+        radius_m: Radius of each top, shape (T,): points of the outer 1 mm are mixed with the background and left out.
+        config: Noise of a cap's top.
+    """
+    count = len(expected_m)
+    inside = np.hypot(*offset_m.T) < radius_m[label] - 1e-3
+    inside &= np.abs(height_m - expected_m[label]) < config.top_band_m
+    label, xy, z = label[inside], offset_m[inside], height_m[inside]
+    start = _median_per_label(label, z, expected_m)
+    coefficients = np.column_stack([start, np.zeros((count, 2))])
+    sigma = np.full(count, config.top_band_m / 3)
+    basis = np.column_stack([np.ones(len(z)), xy])
+    weight = np.ones(len(z))
+    for _ in range(ROUNDS):
+        residual = z - np.einsum("ij,ij->i", basis, coefficients[label])
+        u = residual / (4.0 * sigma[label])
+        weight = np.where(np.abs(u) < 1, (1 - u * u) ** 2, 0.0)
+        coefficients = _solve(label, basis, z, weight, coefficients, config)
+        sigma = _scale(label, residual, weight, count)
+    n = np.bincount(label, weight > 0, minlength=count).astype(np.intp)
+    enough = n >= config.min_top_points
+    lever2 = radius_m**2 / 4
+    # One independent shared error per patch of the error's reach.
+    patches = np.maximum((radius_m / config.shared_error_reach_m) ** 2, 3.0)
+    slope_var = (sigma**2 / np.maximum(n, 3) + config.shared_error_m**2 / patches) / lever2
+    return TopPlanes(
+        np.where(enough, coefficients[:, 0], np.nan),
+        np.where(enough[:, None], coefficients[:, 1:], np.nan),
+        slope_var,
+        sigma,
+        n,
+    )
+
+
+def _median_per_label(label: NDArray[np.intp], values: FloatArray, default: FloatArray) -> FloatArray:
+    """Median of the values of each label, the default without any; shape (T,)."""
+    order = np.lexsort((values, label))
+    counts = np.bincount(label, minlength=len(default))
+    ends = np.cumsum(counts)
+    middle = np.minimum(ends - counts + counts // 2, max(len(values) - 1, 0))
+    return np.where(counts > 0, values[order][middle], default) if len(values) else default.copy()
+
+
+def _solve(
+    label: NDArray[np.intp],
+    basis: FloatArray,
+    values: FloatArray,
+    weight: FloatArray,
+    before: FloatArray,
+    config: ProfileConfig,
+) -> FloatArray:
+    """Weighted least squares of every label, shape (T, 3); as before where there are too few points."""
+    count = len(before)
+    normal, right = np.empty((count, 3, 3)), np.empty((count, 3))
+    for i in range(3):
+        scaled = weight * basis[:, i]
+        right[:, i] = np.bincount(label, scaled * values, minlength=count)
+        for j in range(i, 3):
+            normal[:, i, j] = normal[:, j, i] = np.bincount(label, scaled * basis[:, j], minlength=count)
+    usable = (normal[:, 0, 0] >= config.min_top_points / 4) & (np.linalg.det(normal) > 0)
+    normal[~usable] = np.eye(3)
+    solved = np.linalg.solve(normal, right[..., None])[..., 0]
+    return np.where(usable[:, None], solved, before)
+
+
+def _scale(label: NDArray[np.intp], residual: FloatArray, weight: FloatArray, count: int) -> FloatArray:
+    """Weighted rms of the residuals of every label, at least 0.03 mm, shape (T,), metres."""
+    total = np.maximum(np.bincount(label, weight, minlength=count), 1e-9)
+    return np.maximum(np.sqrt(np.bincount(label, weight * residual**2, minlength=count) / total), 3e-5)

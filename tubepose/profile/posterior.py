@@ -1,0 +1,151 @@
+"""What is known of every tube's pose: what was measured of its top and wall, and what its slot allows.
+
+Unknowns of a tube, in its slot's frame (rack axes, origin on the slot floor's centre): where the point that the floor
+holds (a round bottom's centre, or the tip) stands, (u, v), and the slope of the axis, (a, b) = (dx/dz, dy/dz).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+from scipy.special import log_expit
+from scipy.stats import norm, qmc
+
+from tubepose.config import ProfileConfig
+from tubepose.labware import RackModel, SlotModel, TubeModel
+from tubepose.transforms import FloatArray
+
+SAMPLES = 512
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Evidence:
+    """Gaussian measurements of the four unknowns as information, T tubes.
+
+    Attributes:
+        matrix: Information matrix over (u, v, a, b), shape (T, 4, 4); metres and slopes.
+        vector: Information vector, shape (T, 4).
+    """
+
+    matrix: FloatArray
+    vector: FloatArray
+
+    def __add__(self, other: Evidence) -> Evidence:
+        return Evidence(self.matrix + other.matrix, self.vector + other.vector)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Posterior:
+    """Poses and how well they are known, T tubes.
+
+    Attributes:
+        mean: (u, v, a, b), shape (T, 4).
+        covariance: Shape (T, 4, 4).
+        allowed: Share of what the measurements leave open that the slot allows, shape (T,): near 0 where a tube stands
+            or leans as its slot does not let it.
+    """
+
+    mean: FloatArray
+    covariance: FloatArray
+    allowed: FloatArray
+
+
+def pivot_m(tube: TubeModel) -> float:
+    """Height above a tube's origin of the point that a slot's floor holds: a round bottom's centre, or the tip."""
+    return tube.body.bottom_height_mm * 1e-3 if tube.body.bottom == "round" else 0.0
+
+
+def no_evidence(count: int) -> Evidence:
+    """Nothing measured."""
+    return Evidence(np.zeros((count, 4, 4)), np.zeros((count, 4)))
+
+
+def evidence(design: FloatArray, value: FloatArray, covariance: FloatArray) -> Evidence:
+    """Measurements ``value = design x`` as information; rows with NaN say nothing.
+
+    Args:
+        design: Array of shape (T, K, 4).
+        value: Array of shape (T, K).
+        covariance: Array of shape (T, K, K).
+    """
+    known = np.isfinite(value).all(axis=1)
+    filled = np.where(known[:, None, None], covariance, np.eye(value.shape[1]))
+    weighted = np.linalg.solve(filled, design) * known[:, None, None]
+    vector = np.einsum("tki,tk->ti", weighted, np.nan_to_num(value))
+    return Evidence(np.einsum("tki,tkj->tij", weighted, design), vector)
+
+
+def combine(
+    measured: Evidence, slots: Sequence[SlotModel], tubes: Sequence[TubeModel], rack: RackModel, config: ProfileConfig
+) -> Posterior:
+    """Posterior mean and covariance under the slot's prior.
+
+    The prior is what can be: the held point anywhere on the disc of the rack's floor play, the body anywhere inside the
+    slot's walls; both have soft edges of `slot_tolerance_m`. It is no Gaussian: a Gaussian of about its size and the
+    measurements give a proposal, whose fixed quasi-random samples are weighted by the prior over that Gaussian.
+    """
+    play = np.full(len(tubes), max(rack.floor_play_mm * 1e-3, 0.2e-3))
+    spread = np.array(
+        [play / 2, play / 2, np.full_like(play, config.slope_std), np.full_like(play, config.slope_std)]
+    ).T
+    prior = np.zeros((len(tubes), 4, 4))
+    prior[:, range(4), range(4)] = spread**-2.0
+    covariance = np.linalg.inv(measured.matrix + prior)
+    mean = np.einsum("tij,tj->ti", covariance, measured.vector)
+    root = np.linalg.cholesky(covariance)
+    x = mean[:, None, :] + np.einsum("tij,mj->tmi", root, _normal_samples())
+    log_prior = _log_allowed(x, play, slots, tubes, rack, config)
+    log_weight = log_prior + 0.5 * ((x / spread[:, None, :]) ** 2).sum(axis=2)
+    top = log_weight.max(axis=1, keepdims=True)
+    weight = np.exp(log_weight - top)
+    weight /= weight.sum(axis=1, keepdims=True)
+    posterior = np.einsum("tm,tmi->ti", weight, x)
+    off = x - posterior[:, None, :]
+    spread_out = np.einsum("tm,tmi,tmj->tij", weight, off, off)
+    # Where hardly a sample is left its scatter says nothing: at least a tenth of what the measurements leave.
+    return Posterior(posterior, spread_out + 0.01 * covariance, np.exp(log_prior).mean(axis=1))
+
+
+@lru_cache(maxsize=1)
+def _normal_samples() -> FloatArray:
+    """Quasi-random standard normal samples, shape (SAMPLES, 4), always the same, with mean 0."""
+    uniform = qmc.Sobol(4, scramble=True, rng=np.random.default_rng(0)).random(SAMPLES // 2)
+    half = norm.ppf(np.clip(uniform, 1e-6, 1 - 1e-6))
+    return np.asarray(np.concatenate([half, -half]))
+
+
+def _log_allowed(
+    x: FloatArray,
+    play_m: FloatArray,
+    slots: Sequence[SlotModel],
+    tubes: Sequence[TubeModel],
+    rack: RackModel,
+    config: ProfileConfig,
+) -> FloatArray:
+    """Log of how far each sample (T, M, 4) is allowed: 0 inside, falling at the edges; shape (T, M).
+
+    A straight body with a straight taper in a convex slot is inside if it is at both ends of what is inside: at the held
+    point and at the rack's top.
+    """
+    soft = config.slot_tolerance_m / 1.7
+    total = log_expit((play_m[:, None] - np.hypot(x[..., 0], x[..., 1])) / soft)
+    groups: dict[tuple[object, ...], list[int]] = {}
+    for i, slot in enumerate(slots):
+        groups.setdefault((slot.shape, slot.size_mm, slot.corner_radius_mm), []).append(i)
+    held = np.array([pivot_m(tube) for tube in tubes])
+    top = np.array([min(rack.depth_m, tube.height_m) for tube in tubes])
+    radius = np.array(
+        [[float(t.body_radius_m(h)), float(t.body_radius_m(z))] for t, h, z in zip(tubes, held, top, strict=True)]
+    )
+    for members in groups.values():
+        slot = slots[members[0]]
+        at = np.asarray(members)
+        for end, z in enumerate((held, top)):
+            xy = x[at, :, :2] + x[at, :, 2:] * (z - held)[at, None, None]
+            room = -slot.signed_distance_m(xy + slot.center_m) - radius[at, end][:, None]
+            # The slot's own tolerance at its floor is the floor's play.
+            total[at] += log_expit(room / soft)
+    return np.asarray(total)

@@ -1,0 +1,163 @@
+"""Middle of every open rim: the bright ring that it makes in the image, whatever the depth on it says."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tubepose.capture.frame import CameraIntrinsics, RgbdFrame
+from tubepose.config import ProfileConfig
+from tubepose.profile.outline import NORMALS, SECTORS, Circles, fit_circles
+from tubepose.transforms import FloatArray, transform_points
+
+BIN_M = 0.25e-3
+WIDE_M = 1.75e-3
+"""How far off its expected place a whole ring is looked for, before its sectors one by one."""
+SEARCH_M = 0.9e-3
+"""How far off its expected radius a sector of the ring is looked for."""
+ROUNDS = 2
+MIN_CONTRAST = 0.35
+"""Correlation of a sector's brightness with a ring's, below which the sector does not count."""
+
+
+def fit_rims(
+    frame: RgbdFrame,
+    intrinsics: CameraIntrinsics,
+    T_camera_rack: FloatArray,
+    center_m: FloatArray,
+    level_m: FloatArray,
+    radii_m: FloatArray,
+    blocked: NDArray[np.bool_],
+    config: ProfileConfig,
+) -> Circles:
+    """Middle of rims in the frame's image, or without one in the picture of where there is depth.
+
+    For each sector of each rim the mean brightness over the radius is compared with that of a ring between the rim's
+    two radii, moved inwards and outwards; the best move is the sector's radius.
+
+    Args:
+        frame: The frame; organised.
+        intrinsics: Of its image.
+        T_camera_rack: The rack's pose, shape (4, 4), metres.
+        center_m: Middle of each rim as known so far, rack frame, shape (T, 2), metres.
+        level_m: Height of each rim above the rack's base, shape (T,).
+        radii_m: Inner and outer radius of each rim, shape (T, 2).
+        blocked: Sectors that another top is too near to, shape (T, SECTORS).
+        config: Noise of outlines.
+    """
+    picture = brightness(frame)
+    view = (picture, intrinsics, T_camera_rack)
+    profile, steps_m = _radial_profiles(*view, center_m, level_m, radii_m, WIDE_M)
+    moves_m, _, correlation = _ring_scores(profile, steps_m, radii_m, WIDE_M)
+    shift = _whole_ring_shift(moves_m, correlation, blocked)
+    circles: Circles | None = None
+    # The picture of depth has no ring where depth is too deep: it is worth less.
+    bias_m = config.rim_bias_m if frame.image is not None else 3 * config.rim_bias_m
+    for _ in range(ROUNDS):
+        profile, steps_m = _radial_profiles(*view, center_m + shift, level_m, radii_m, SEARCH_M)
+        move_m, contrast = _ring_moves(*_ring_scores(profile, steps_m, radii_m, SEARCH_M))
+        circles = fit_circles(move_m, (contrast > MIN_CONTRAST) & ~blocked, config, config.rim_noise_m, bias_m)
+        shift = shift + np.nan_to_num(circles.offset_m)
+    assert circles is not None
+    offset = np.where(np.isfinite(circles.offset_m), shift, np.nan)
+    return Circles(offset, circles.covariance_m2, circles.widening_m, circles.sectors)
+
+
+def brightness(frame: RgbdFrame) -> NDArray[np.float32]:
+    """Gray values of a frame, shape (H, W); 1 and 0 for pixels with and without depth where it has no image."""
+    if frame.image is None:
+        return np.isfinite(frame.cloud_m[..., 2]).astype(np.float32)
+    image = frame.image.astype(np.float32)
+    return image if image.ndim == 2 else image.mean(axis=2)
+
+
+def _radial_profiles(
+    picture: NDArray[np.float32],
+    intrinsics: CameraIntrinsics,
+    T_camera_rack: FloatArray,
+    center_m: FloatArray,
+    level_m: FloatArray,
+    radii_m: FloatArray,
+    search_m: float,
+) -> tuple[FloatArray, FloatArray]:
+    """Brightness of every rim by sector and radius, shape (T, SECTORS, B), and the radii off the ring's middle, (B,).
+
+    The picture is read, between its pixels, at the places where points of the level plane are seen.
+    """
+    middle = radii_m.mean(axis=1)
+    # The ring's own width on both sides of it is its background.
+    reach = search_m + float(np.ptp(radii_m, axis=1).max()) + BIN_M
+    steps = np.arange(-reach, reach + BIN_M / 2, BIN_M)
+    angle = (np.arange(3 * SECTORS) + 0.5) / (3 * SECTORS) * 2 * np.pi - np.pi
+    r = middle[:, None, None] + steps
+    x = center_m[:, 0, None, None] + r * np.cos(angle)[None, :, None]
+    y = center_m[:, 1, None, None] + r * np.sin(angle)[None, :, None]
+    z = np.broadcast_to(level_m[:, None, None], x.shape)
+    uv = intrinsics.project(transform_points(T_camera_rack, np.stack([x, y, z], axis=-1)))
+    values = _bilinear(picture, uv[..., 0], uv[..., 1])
+    return values.reshape(len(center_m), SECTORS, 3, len(steps)).mean(axis=2), steps
+
+
+def _bilinear(picture: NDArray[np.float32], u: FloatArray, v: FloatArray) -> FloatArray:
+    """Values between pixels; outside of the picture those of its border."""
+    height, width = picture.shape
+    u, v = np.clip(u, 0, width - 1.001), np.clip(v, 0, height - 1.001)
+    left, top = u.astype(np.intp), v.astype(np.intp)
+    du, dv = u - left, v - top
+    flat = picture.reshape(-1)
+    at = top * width + left
+    upper = flat[at] * (1 - du) + flat[at + 1] * du
+    lower = flat[at + width] * (1 - du) + flat[at + width + 1] * du
+    return np.asarray(upper * (1 - dv) + lower * dv)
+
+
+def _ring_scores(
+    profile: FloatArray, steps_m: FloatArray, radii_m: FloatArray, search_m: float
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Moves outwards, shape (M,), metres; the contrast of every sector with a ring there, and its correlation.
+
+    The last two have the shape (T, SECTORS, M).
+    """
+    half = ((radii_m[:, 1] - radii_m[:, 0]) / 2)[:, None, None]
+    moves = np.arange(-search_m, search_m + BIN_M / 4, BIN_M / 2)
+    # A ring blurred by a bin, with a background as wide as itself on either side.
+    off = np.abs(steps_m[None, None, :] - moves[None, :, None])
+    ring = np.clip((half + BIN_M / 2 - off) / BIN_M, 0, 1)
+    window = np.clip((2 * half + BIN_M / 2 - off) / BIN_M, 0, 1)
+    total = window.sum(axis=2)
+    template = window * (ring - ((ring * window).sum(axis=2) / total)[..., None])
+    norm2 = (template**2 / np.maximum(window, 1e-9)).sum(axis=2)
+    score = np.einsum("tsb,tmb->tsm", profile, template)
+    mean = np.einsum("tsb,tmb->tsm", profile, window) / total[:, None, :]
+    scatter = np.einsum("tsb,tmb->tsm", profile**2, window) - mean**2 * total[:, None, :]
+    return moves, score, score / np.sqrt(np.maximum(norm2[:, None, :] * scatter, 1e-12))
+
+
+def _whole_ring_shift(moves_m: FloatArray, correlation: FloatArray, blocked: NDArray[np.bool_]) -> FloatArray:
+    """Shift of every ring, shape (T, 2), metres, at which its sectors correlate best together."""
+    axis = np.arange(-WIDE_M, WIDE_M + 1e-9, BIN_M)
+    shifts = np.stack(np.meshgrid(axis, axis), axis=-1).reshape(-1, 2)
+    shifts = shifts[np.hypot(*shifts.T) <= WIDE_M]
+    at = np.rint((shifts @ NORMALS.T - moves_m[0]) / (moves_m[1] - moves_m[0])).astype(np.intp)
+    at = np.clip(at, 0, len(moves_m) - 1)
+    usable = np.where(blocked[..., None], 0.0, np.maximum(correlation, 0.0))
+    total = np.zeros((len(correlation), len(shifts)))
+    for sector in range(SECTORS):
+        total += usable[:, sector, at[:, sector]]
+    return np.asarray(shifts[total.argmax(axis=1)])
+
+
+def _ring_moves(moves_m: FloatArray, score: FloatArray, correlation: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """How far outwards a ring fits each sector best, shape (T, SECTORS), metres, and its correlation there.
+
+    The correlation is 0 where it has no peak within the search.
+    """
+    best = score.argmax(axis=2)
+    inner = np.clip(best, 1, len(moves_m) - 2)
+    t, s = np.ogrid[: score.shape[0], : score.shape[1]]
+    before, peak, after = (score[t, s, inner + k] for k in (-1, 0, 1))
+    curve = before - 2 * peak + after
+    with np.errstate(divide="ignore", invalid="ignore"):
+        fraction = np.where(curve < 0, 0.5 * (before - after) / curve, 0.0)
+    move = moves_m[inner] + np.clip(fraction, -0.5, 0.5) * (moves_m[1] - moves_m[0])
+    return move, np.where(best == inner, correlation[t, s, inner], 0.0)

@@ -1,0 +1,226 @@
+"""Where tubes stand: the discs and rings of caps and rims, looked for above every slot, and the type that fits there."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from tubepose.config import ProfileConfig
+from tubepose.labware import RackModel, SlotModel, TubeModel
+from tubepose.profile.standing import OUTSIDE_M, Standing
+from tubepose.transforms import FloatArray
+
+CELL_M = 1.0e-3
+PASSES = 3
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Tops:
+    """Tops of tubes, one entry each; T of them.
+
+    Attributes:
+        slot: Index of the slot that each stands in, shape (T,).
+        tube: Index of its type among the candidates, shape (T,).
+        center_m: Middle of its top circle on the level of its type's top, rack frame, shape (T, 2), metres.
+        support: Share of the top that is seen less the share of its surroundings that is, 0 to 1, shape (T,).
+        runner_up: The same of the next best type at that place, shape (T,); -inf without one.
+    """
+
+    slot: NDArray[np.intp]
+    tube: NDArray[np.intp]
+    center_m: FloatArray
+    support: FloatArray
+    runner_up: FloatArray
+
+    def take(self, keep: NDArray[np.bool_]) -> Tops:
+        """The same of some of the tops."""
+        return Tops(self.slot[keep], self.tube[keep], self.center_m[keep], self.support[keep], self.runner_up[keep])
+
+
+def top_level_m(tube: TubeModel, rack: RackModel) -> float:
+    """Height of an upright tube's top above the rack's base, metres."""
+    return rack.floor_m + tube.height_m
+
+
+def mouth_radius_m(tube: TubeModel) -> float:
+    """Inner radius of an open tube's rim, metres; 0 for a closed one."""
+    return float(tube.body_radius_m(tube.rim_height_m)) - tube.body.wall_mm * 1e-3 if tube.is_open else 0.0
+
+
+def top_radius_m(tube: TubeModel) -> float:
+    """Outer radius of a tube's top circle, metres: of its cap, flange or bare rim."""
+    return tube.cap.diameter_mm * 0.5e-3 if tube.cap is not None else float(tube.body_radius_m(tube.rim_height_m))
+
+
+def in_top_band(heights_m: FloatArray, tube: TubeModel, rack: RackModel, config: ProfileConfig) -> NDArray[np.bool_]:
+    """Which heights above the rack's base can be of a tube's top; light returns from below the surface of a rim."""
+    off = heights_m - top_level_m(tube, rack)
+    below = config.rim_depth_m if tube.is_open else config.top_band_m
+    return np.asarray((off > -below) & (off < config.top_band_m))
+
+
+def find_tops(
+    standing: Standing,
+    rack: RackModel,
+    tubes: Sequence[TubeModel],
+    config: ProfileConfig,
+    allowed: NDArray[np.bool_] | None = None,
+) -> Tops:
+    """Best top over every slot that has one.
+
+    For each type the points near the height of its top become a picture of the rack from above, and each place gets the
+    share of a disc (or of the ring of a rim) about it that is filled, less that of what should be empty, and less the
+    more the points' mean height is off. Each slot takes the best place that a tube in it can reach, among all types.
+    Tops that overlap are cut down to the better one; then the slots that are left look again, without the points of
+    the tops that were found: a neighbour's cap hides the place of its own.
+
+    Args:
+        standing: Points above the rack's top.
+        rack: The rack.
+        tubes: Candidate types.
+        config: Limits.
+        allowed: Which type may stand in which slot, shape (K, S); all by default.
+    """
+    count = len(rack.all_slots)
+    may = np.ones((len(tubes), count), bool) if allowed is None else allowed
+    pictures = [_filled(standing, rack, tube, config) for tube in tubes]
+    best = np.full(count, -1)
+    place = np.full((count, 3), -np.inf)
+    second = np.full(count, -np.inf)
+    for _ in range(PASSES):
+        open_slots = np.flatnonzero(best < 0)
+        found = np.full((len(tubes), count, 3), -np.inf)
+        for k, tube in enumerate(tubes):
+            score = _top_score(*pictures[k], tube, config)
+            for i in open_slots[may[k, open_slots]]:
+                found[k, i] = _best_place(score, rack.all_slots[i], rack, tube, config)
+        ranked = np.sort(found[:, :, 0], axis=0)
+        kind = found[:, :, 0].argmax(axis=0)
+        least = np.array([least_support(tube, config) for tube in tubes])[kind]
+        candidates = open_slots[ranked[-1, open_slots] > least[open_slots]]
+        where = found[kind, np.arange(count)]
+        taken = np.flatnonzero(best >= 0)
+        new = _without_overlaps(
+            candidates, taken, np.where(best >= 0, best, kind), np.where((best >= 0)[:, None], place, where), tubes
+        )
+        if len(new) == 0:
+            break
+        best[new], place[new] = kind[new], where[new]
+        second[new] = ranked[-2, new] if len(tubes) > 1 else -np.inf
+        for k in range(len(tubes)):
+            _erase(pictures[k], place[new, 1:], [top_radius_m(tubes[best[i]]) for i in new], rack)
+    kept = np.flatnonzero(best >= 0)
+    return Tops(kept, best[kept], place[kept, 1:], place[kept, 0], second[kept])
+
+
+def least_support(tube: TubeModel, config: ProfileConfig) -> float:
+    """Least support that makes a top; rims of clear plastic have few points, and are looked at in the image again."""
+    return config.min_rim_support if tube.is_open else config.min_support
+
+
+def _filled(
+    standing: Standing, rack: RackModel, tube: TubeModel, config: ProfileConfig
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Pictures from above of the points near a type's top, cells of `CELL_M`: 1 where there is one; its height off the top."""
+    near = standing.points_m[in_top_band(standing.points_m[:, 2], tube, rack, config)]
+    half = rack.outline_m / 2 + OUTSIDE_M
+    size = np.ceil(2 * half / CELL_M).astype(int) + 1
+    filled, off = np.zeros(size, np.float32), np.zeros(size, np.float32)
+    xy = standing.on_level(top_level_m(tube, rack), near)
+    inside = np.all(np.abs(xy) < half, axis=1)
+    cells = np.rint((xy[inside] + half) / CELL_M).astype(np.intp)
+    filled[cells[:, 0], cells[:, 1]] = 1.0
+    off[cells[:, 0], cells[:, 1]] = near[inside, 2] - top_level_m(tube, rack)
+    return filled, off
+
+
+def _top_score(
+    filled: NDArray[np.float32], off_m: NDArray[np.float32], tube: TubeModel, config: ProfileConfig
+) -> NDArray[np.float32]:
+    """Filled share of the top about every cell, less that of the ring around it and of the mouth in it."""
+    radius, mouth = top_radius_m(tube), mouth_radius_m(tube)
+    reach = int(np.ceil((radius + 2e-3) / CELL_M))
+    offsets = np.arange(-reach, reach + 1) * CELL_M
+    r = np.hypot(*np.meshgrid(offsets, offsets))
+    top = (r <= radius - 0.3e-3) & (r >= mouth + (0.3e-3 if mouth else 0.0))
+    around = (r > radius + 0.5e-3) & (r <= radius + 2e-3)
+    kernel = top / top.sum() - around / around.sum()
+    if mouth:
+        core = r < mouth - 1.5e-3
+        kernel = kernel - 0.5 * core / core.sum()
+    score = _filter(filled, kernel)
+    if tube.is_open:
+        return score
+    mean_off_m = _filter(off_m, top * 1.0) / np.maximum(_filter(filled, top * 1.0), 1.0)
+    return np.asarray(score * np.exp(-0.5 * (mean_off_m / (2 * config.cap_height_m)) ** 2), np.float32)
+
+
+def _filter(picture: NDArray[np.float32], kernel: FloatArray) -> NDArray[np.float32]:
+    return np.asarray(cv2.filter2D(picture, cv2.CV_32F, kernel.astype(np.float32), borderType=cv2.BORDER_CONSTANT))
+
+
+def _erase(
+    pictures: tuple[NDArray[np.float32], NDArray[np.float32]],
+    center_m: FloatArray,
+    radius_m: Sequence[float],
+    rack: RackModel,
+) -> None:
+    """Empty a type's own pictures where tops were found."""
+    half = rack.outline_m / 2 + OUTSIDE_M
+    for center, radius in zip(center_m, radius_m, strict=True):
+        at = np.rint((center + half) / CELL_M).astype(int)
+        for picture in pictures:
+            cv2.circle(picture, (int(at[1]), int(at[0])), int(np.ceil((radius + 0.7e-3) / CELL_M)), 0.0, -1)
+
+
+def _best_place(
+    score: NDArray[np.float32], slot: SlotModel, rack: RackModel, tube: TubeModel, config: ProfileConfig
+) -> tuple[float, float, float]:
+    """Best score and its place (x, y) in metres, within what a tube in the slot can reach with its top."""
+    half = rack.outline_m / 2 + OUTSIDE_M
+    reach = top_reach_m(slot, tube, rack) + config.reach_m
+    low = np.maximum(np.floor((slot.center_m - reach + half) / CELL_M).astype(int), 0)
+    high = np.ceil((slot.center_m + reach + half) / CELL_M).astype(int) + 1
+    window = score[low[0] : high[0], low[1] : high[1]]
+    peak = float(window.max(initial=-np.inf))
+    if not np.isfinite(peak):
+        return -np.inf, np.nan, np.nan
+    # Several cells are as good: the middle of those close to the best.
+    places = np.argwhere(window >= peak - 0.03)
+    first = places[np.argmax(window[places[:, 0], places[:, 1]])]
+    places = places[np.hypot(*(places - first).T) < 3.5]
+    x, y = (places.mean(axis=0) + low) * CELL_M - half
+    return peak, float(x), float(y)
+
+
+def top_reach_m(slot: SlotModel, tube: TubeModel, rack: RackModel) -> float:
+    """How far the middle of a tube's top can be from its slot's axis, metres: the floor's play, and the lean beyond."""
+    play = rack.floor_play_mm * 1e-3
+    room = float(np.max(np.maximum(slot.half_size_m - tube.body_radius_m(rack.depth_m), 0.0)))
+    return play + (room + play) * tube.height_m / min(rack.depth_m, tube.height_m)
+
+
+def _without_overlaps(
+    slots: NDArray[np.intp],
+    taken: NDArray[np.intp],
+    kind: NDArray[np.intp],
+    place: FloatArray,
+    tubes: Sequence[TubeModel],
+) -> NDArray[np.intp]:
+    """Slots in order, without those whose top overlaps a better one or one that was found before: discs cannot."""
+    radius = np.array([top_radius_m(tube) for tube in tubes])
+    kept = [int(slot) for slot in taken]
+    new: list[int] = []
+    for slot in slots[np.argsort(-place[slots, 0], kind="stable")]:
+        gap = [
+            np.hypot(*(place[slot, 1:] - place[other, 1:])) - 0.75 * (radius[kind[slot]] + radius[kind[other]])
+            for other in kept
+        ]
+        if min(gap, default=1.0) > 0:
+            kept.append(int(slot))
+            new.append(int(slot))
+    return np.array(sorted(new), np.intp)

@@ -1,0 +1,109 @@
+"""What the wall below a tube's cap or rim says of its axis, where the points on it can be believed.
+
+Light comes out of milky plastic where it was scattered to, clear plastic shows what lies behind it, and a paper label
+lies where the wall is. The three are told apart by what the points do: points of a surface pile up at its radius,
+those of scattered light do not. So the evidence of a wall is weighed by its peak: the share of the points near the
+radius that are more than those beside it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tubepose.config import ProfileConfig
+from tubepose.labware import RackModel, TubeModel
+from tubepose.profile.posterior import Evidence, no_evidence, pivot_m
+from tubepose.profile.standing import Standing
+from tubepose.transforms import FloatArray
+
+PEAK = 2.0
+"""Points within this many standard deviations are the peak, those within twice to four times as many its background."""
+SKIRT_GAP_M = 1.0e-3
+
+
+def wall_evidence(
+    standing: Standing,
+    label: NDArray[np.intp],
+    pose: FloatArray,
+    centers_m: FloatArray,
+    tubes: Sequence[TubeModel],
+    rack: RackModel,
+    config: ProfileConfig,
+) -> Evidence:
+    """Evidence of the walls of all tubes, linearised at their poses.
+
+    Residual of a point at height s above the tube's bottom and distance rho from its axis: ``rho - r(s)``, r the body's
+    radius. It moves with the axis at that height, ``-n (u + (s - q) a)``, n the direction from the axis to the point.
+    The wall's true radius is an unknown of its own with a prior: points lie on the camera's side alone, where a wider
+    wall and a nearer axis look the same.
+
+    Args:
+        standing: Points above the rack's top.
+        label: Tube of each point, -1 for none.
+        pose: (u, v, a, b) of every tube, shape (T, 4), metres and slopes.
+        centers_m: Centre of every tube's slot, shape (T, 2).
+        tubes: Type of every tube.
+        rack: The rack.
+        config: Noise of walls.
+    """
+    count = len(tubes)
+    if count == 0:
+        return no_evidence(0)
+    residual, normal, above, of = _wall_points(standing, label, pose, centers_m, tubes, rack, config)
+    sigma = config.wall_noise_m
+    near = np.abs(residual) < PEAK * sigma
+    beside = ~near & (np.abs(residual) < 2 * PEAK * sigma)
+    n_near, n_beside = (np.bincount(of[chosen], minlength=count) for chosen in (near, beside))
+    peak = np.clip((n_near - n_beside) / np.maximum(n_near, 1), 0.0, 1.0)
+    weight = np.where(near, (1 - (residual / (PEAK * sigma)) ** 2) ** 2, 0.0) * (peak**2)[of]
+    weight *= (n_near >= config.min_wall_points)[of] / (sigma**2 * config.wall_redundancy)
+    rows = np.column_stack([-normal, -normal * above[:, None], np.ones(len(of))])
+    target = residual - np.einsum("ij,ij->i", rows[:, :4], pose[of])
+    matrix, vector = np.zeros((count, 5, 5)), np.zeros((count, 5))
+    for i in range(5):
+        scaled = weight * rows[:, i]
+        vector[:, i] = np.bincount(of, scaled * target, minlength=count)
+        for j in range(i, 5):
+            matrix[:, i, j] = matrix[:, j, i] = np.bincount(of, scaled * rows[:, j], minlength=count)
+    # residual = target + rows x = 0 is wanted: rows x = -target; the radius is marginalised.
+    vector = -vector
+    matrix[:, 4, 4] += 1 / config.wall_radius_m**2
+    gain = matrix[:, :4, 4] / matrix[:, 4, 4][:, None]
+    return Evidence(
+        matrix[:, :4, :4] - gain[:, :, None] * matrix[:, None, 4, :4], vector[:, :4] - gain * vector[:, 4][:, None]
+    )
+
+
+def _wall_points(
+    standing: Standing,
+    label: NDArray[np.intp],
+    pose: FloatArray,
+    centers_m: FloatArray,
+    tubes: Sequence[TubeModel],
+    rack: RackModel,
+    config: ProfileConfig,
+) -> tuple[FloatArray, FloatArray, FloatArray, NDArray[np.intp]]:
+    """Residual, direction from the axis (N, 2), height above the held point, and tube of the points near a wall."""
+    held = np.array([pivot_m(tube) for tube in tubes])
+    skirt = np.array([t.height_m - (t.cap.height_mm * 1e-3 if t.cap is not None else 0.0) for t in tubes]) - SKIRT_GAP_M
+    body = np.array([[t.body.bottom_diameter_mm, t.body.top_diameter_mm] for t in tubes]) * 0.5e-3
+    ends = np.array([[t.body.bottom_height_mm, t.body.height_mm] for t in tubes]) * 1e-3
+    rows = np.flatnonzero(label >= 0)
+    of = label[rows]
+    low = standing.points_m[rows, 2] - rack.floor_m < skirt[of]
+    rows, of = rows[low], of[low]
+    p = standing.points_m[rows]
+    above = p[:, 2] - rack.floor_m - held[of]
+    off = p[:, :2] - centers_m[of] - pose[of, :2] - above[:, None] * pose[of, 2:]
+    # The cut through a leaning tube is an ellipse: across the lean the radius, along it longer by 1 / cos.
+    rho = np.hypot(*off.T)
+    s = above + held[of]
+    share = np.clip((s - ends[of, 0]) / (ends[of, 1] - ends[of, 0]), 0, 1)
+    residual = rho - (body[of, 0] + share * (body[of, 1] - body[of, 0]))
+    towards = standing.camera_m[:2] - p[:, :2]
+    kept = (np.abs(residual) < 2 * PEAK * config.wall_noise_m) & (np.einsum("ij,ij->i", off, towards) > 0)
+    normal = off[kept] / rho[kept][:, None]
+    return residual[kept], normal, above[kept], of[kept]
