@@ -101,6 +101,18 @@ def test_printed_and_original_captures_share_all_poses(tmp_path, seen_scenes):
         assert np.array_equal(printed.T_camera_rack, original.T_camera_rack)
 
 
+def test_without_printed_captures_the_others_are_the_same(tmp_path):
+    whole = simulate(tmp_path / "whole", tubes=TUBES[:1])
+    half = simulate(tmp_path / "half", tubes=TUBES[:1], printed=False)
+    session = load_session(half)
+    (trial,) = session.trials
+    assert (trial.printed, session.printed_cap) == (None, CAP)
+    assert session.name != load_session(whole).name
+    kept = digests(half)
+    assert {path.name for path in (half / "captures").iterdir()} == {"chen2023-tube-1-001-original"}
+    assert kept.items() - digests(whole).items() == {("session.yaml", kept["session.yaml"])}
+
+
 def test_the_hint_points_at_the_first_slot(tmp_path, seen_scenes):
     session = load_session(simulate(tmp_path / "s", tubes=TUBES[:1], resolution=688))
     hint = session.trials[0].hint

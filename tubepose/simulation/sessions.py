@@ -83,6 +83,7 @@ def simulate_session(
     variation: SceneVariation = DEFAULT_VARIATION,
     mixed: bool = False,
     calibration_error: bool = True,
+    printed: bool = True,
     capture_format: CaptureFormat = "folder",
     threads: int = 1,
     resume: bool = False,
@@ -103,6 +104,8 @@ def simulate_session(
         variation: Ranges that the scenes are drawn from. At least one slot is filled.
         mixed: Any of the types in each trial.
         calibration_error: Whether the camera has one.
+        printed: Whether each trial has its capture with printed caps, without which there is the exact truth alone. The
+            other capture, and the room that tubes leave for printed caps, do not depend on it.
         capture_format: How captures are stored.
         threads: How many to use; they change no byte. More than one mean more processes, see `in_processes`.
         resume: Keep finished captures beside `out` if the session ends early, and go on from there in the next call.
@@ -119,7 +122,7 @@ def simulate_session(
     _check_names(sensor, capture_format)
     camera = _camera(resolution, calibration_error)
     settings = _Settings(rack, tuple(tubes), cap, camera, sensor, variation, capture_format, seed)
-    drawn = [_draw(plan, settings) for plan in _plans(tubes, trials, seed, mixed)]
+    drawn = [_draw(plan, settings, printed) for plan in _plans(tubes, trials, seed, mixed)]
     aside = out.with_name(f".{out.name}.part" if resume else f".{out.name}.part-{os.getpid()}")
     if not resume:
         shutil.rmtree(aside, ignore_errors=True)
@@ -178,7 +181,7 @@ def _plans(tubes: Sequence[TubeModel], trials: int, seed: int, mixed: bool) -> I
             yield _Plan(f"{label}-{k + 1:03d}", group * 100_000 + k, types, tuple(seeds))
 
 
-def _draw(plan: _Plan, settings: _Settings) -> _Trial:
+def _draw(plan: _Plan, settings: _Settings, printed: bool) -> _Trial:
     """Draw the scene of one trial, which no sensor has a part in."""
     scene_seed, printed_seed, original_seed = plan.seeds
     rng = np.random.default_rng(scene_seed)
@@ -190,9 +193,10 @@ def _draw(plan: _Plan, settings: _Settings) -> _Trial:
     first_ns = _FIRST_STAMP_NS + settings.seed % 3650 * _SESSION_NS + plan.number * _TRIAL_NS
     suffix = ".mcap" if settings.capture_format == "mcap" else ""
     shots = []
-    for i, (label, cap, seed) in enumerate(
-        (("printed", settings.cap, printed_seed), ("original", None, original_seed))
-    ):
+    labels = (("printed", settings.cap, printed_seed), ("original", None, original_seed))
+    for i, (label, cap, seed) in enumerate(labels):
+        if label == "printed" and not printed:
+            continue
         name = f"{plan.name}-{label}"
         entry[label] = f"captures/{name}{suffix}"
         dressed = dataclasses.replace(scene, printed_cap=cap)
