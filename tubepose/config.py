@@ -92,7 +92,9 @@ class RackConfig(_Section):
         max_stray_share: Largest share of such points. On `dev` the right rack has up to 5 %, whatever stands in it, a rack
             of another pitch 12 % or more.
         max_outside_share: Largest share of the top's points just outside the outline (right rack: 0.1 %).
-        max_stretch: How much farther apart, or nearer, than defined slots may lie, beyond three standard deviations.
+        max_stretch: How much farther apart, or nearer, than defined slots may lie, beyond three standard deviations; twice
+            as much where less than clear_seen is seen (right rack: 0.9 and 2.3 %; 17.7 and 18 mm differ by 1.7 %).
+        min_rims: Smallest share of the points expected near edges of openings: with fewer, the openings are wider.
         max_through_share: Largest share of what is seen in place of ribs that lies below them (right rack: 3 %).
         min_seen: Smallest share of the template that is seen: a rack full of caps shows 17 %.
         clear_seen: With this share seen, an accepted pose is not compared with all others that the search can find.
@@ -122,7 +124,8 @@ class RackConfig(_Section):
     edge_margin_m: float = 6.0e-4
     max_stray_share: float = 0.08
     max_outside_share: float = 0.01
-    max_stretch: float = 0.03
+    max_stretch: float = 0.015
+    min_rims: float = 0.4
     max_through_share: float = 0.1
     min_seen: float = 0.1
     clear_seen: float = 0.25
@@ -178,9 +181,10 @@ class ProfileConfig(_Section):
         rim_depth_m: Points this far below an open rim's height can be of it.
         min_support: Least share of a top that is seen, less the share of its surroundings.
         min_rim_support: The same of an open rim.
-        min_rim_sectors: A rim with less support than a closed top must have this share of its ring in the image.
+        min_rim_evidence: Least product of a rim's support and of the share of its ring that is seen in the image.
         min_sectors: Least share of a top's circle whose end is seen.
         reach_m: Added to what a slot lets a tube's top reach, for the rack's error and for looser slots.
+        plane_points: Points of a top that its plane is fitted to.
         min_top_points: Fewer points than this make no plane.
         shared_error_m: Depth error that neighbouring points share, standard deviation.
         shared_error_reach_m: How far it is shared.
@@ -207,9 +211,10 @@ class ProfileConfig(_Section):
     rim_depth_m: float = 3.5e-3
     min_support: float = 0.3
     min_rim_support: float = 0.1
-    min_rim_sectors: float = 0.6
+    min_rim_evidence: float = 0.08
     min_sectors: float = 0.4
     reach_m: float = 1.5e-3
+    plane_points: int = 400
     min_top_points: int = 30
     shared_error_m: float = 2.0e-5
     shared_error_reach_m: float = 3.0e-3

@@ -23,6 +23,8 @@ from tubepose.transforms import FloatArray
 # Half thickness of the layer that is judged: the standard deviation of heights, but at least that of a good sensor, and
 # no more than the layer that a tube's wall fills with few points.
 JUDGED_M = (0.3e-3, 0.6e-3)
+# Points this near an edge are at the rim of an opening.
+RIM_M = 0.7e-3
 # Heights that tell how rough a scan is.
 SCATTER_M = 2.5e-3
 # A top that goes on across its outline is another; a rack that stands beside it may be this near.
@@ -51,6 +53,8 @@ class Agreement:
         fitness: Share of the points at its height that are near its solid part.
         in_slot: Share of them that lie in its openings.
         through: Share of what is seen where the solid part should be that lies below it.
+        rims: How many of the points on the solid part lie near its edges, over the share of its area that does: near 1
+            where the openings are as wide as the template's, little where they are wider.
         coverage: Share of its solid part that has points.
         evidence: How much likelier the points are with the rack there than anywhere, nats of independent points.
         slot_margin: The same less that of the likeliest pose a slot farther along the rows, columns or diagonals.
@@ -64,6 +68,7 @@ class Agreement:
     fitness: float = 0.0
     in_slot: float = 1.0
     through: float = 1.0
+    rims: float = 0.0
     coverage: float = 0.0
     evidence: float = 0.0
     slot_margin: float = 0.0
@@ -99,6 +104,7 @@ def measure_agreement(points_m: FloatArray, fit: Fit, rack: RackModel, config: R
         in_slot=float(np.mean(stray[beyond <= 0])) if np.any(beyond <= 0) else 1.0,
         outside=float(np.mean(stray & (beyond > 0) & (beyond < BORDER_M))),
         through=under / max(under + over, 1),
+        rims=float(np.mean(distance[distance < 0] > -RIM_M)) / _rim_share(rack),
         coverage=_coverage(solid, rack),
         unseen=_unseen(points_m, fit, rack),
         evidence=evidence * alike,
@@ -159,6 +165,13 @@ def _mean_chance(rack: RackModel, sign: int) -> float:
 
 
 @lru_cache(maxsize=32)
+def _rim_share(rack: RackModel) -> float:
+    """Share of the solid part's area that is near an edge."""
+    distance = top_field(rack).table[:, 0]
+    return float(np.mean(distance[distance < 0] > -RIM_M))
+
+
+@lru_cache(maxsize=32)
 def slot_steps_m(rack: RackModel) -> tuple[FloatArray, ...]:
     """Shifts that lay many slots onto others: one slot along rows, columns and diagonals; shape (2,) each, metres."""
     centers = rack.slot_centers_m
@@ -197,6 +210,7 @@ def outline_fits(seen: Agreement, config: RackConfig) -> bool:
 def contradiction(seen: Agreement, fit: Fit, rack: RackModel, config: RackConfig) -> str:
     """Why a fit is not the rack, in words; empty if it is."""
     stretch = np.abs(fit.stretch) - 3 * fit.stretch_std
+    most = config.max_stretch if seen.coverage >= config.clear_seen else 2 * config.max_stretch
     turn_deg, shift_mm = (scale * np.sqrt(np.diag(fit.covariance)[k].max()) for scale, k in _UNITS)
     checks = (
         (
@@ -214,9 +228,14 @@ def contradiction(seen: Agreement, fit: Fit, rack: RackModel, config: RackConfig
             f"at most {config.max_outside_share:.1%} expected: another rack?",
         ),
         (
-            bool(np.any(stretch > config.max_stretch)),
+            bool(np.any(stretch > most)),
             f"the slots lie {fit.stretch[0]:+.1%} and {fit.stretch[1]:+.1%} farther apart than those of {rack.name}, "
-            f"at most {config.max_stretch:.0%} expected: another rack?",
+            f"at most {most:.1%} expected: another rack?",
+        ),
+        (
+            seen.rims < config.min_rims,
+            f"{seen.rims:.0%} of the points expected near the edges of the openings of {rack.name} are there, at least "
+            f"{config.min_rims:.0%} expected: another rack, with wider openings?",
         ),
         (
             seen.through > config.max_through_share,

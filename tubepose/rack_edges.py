@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
+from itertools import islice
 
 import numpy as np
 
@@ -16,7 +18,7 @@ from tubepose.rack_agreement import Agreement, contradiction, measure_agreement,
 from tubepose.rack_field import top_field
 from tubepose.rack_fit import Fit, refine
 from tubepose.rack_pose import MIN_POINTS, RackPose, RackStatus, choose_turn
-from tubepose.rack_search import Hypothesis, search
+from tubepose.rack_search import Band, levels, search
 from tubepose.transforms import HALF_TURN, FloatArray, make_transform
 
 # A rack full of caps shows its lattice better than its ends: so many slots may the search be off.
@@ -27,7 +29,7 @@ RIVAL_WORTH = 0.4
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Registration:
-    """A refined pose and how well the points agree with it."""
+    """A refined pose, how well the points agree with it, and why it is not believed."""
 
     fit: Fit
     agreement: Agreement
@@ -41,7 +43,19 @@ def register_edges(
     if len(points_m) < MIN_POINTS:
         reason = f"{len(points_m)} valid points on the rack, expected at least {MIN_POINTS}"
         return RackPose(RackStatus.INSUFFICIENT, reason)
-    best = best_registration(points_m, rack, config)
+    best = best_registration(points_m, levels(coarse_sample(points_m, config.rack_top), config.rack_top), rack, config)
+    return pose_of(best, points_m, rack, config, hint, intrinsics)
+
+
+def pose_of(
+    best: Registration | None,
+    points_m: FloatArray,
+    rack: RackModel,
+    config: Config,
+    hint: SlotHint | None,
+    intrinsics: CameraIntrinsics | None,
+) -> RackPose:
+    """What to report of the best registration."""
     if best is None:
         return _not_found(points_m, rack, config.rack, "no level band")
     spacing_m = best.agreement.spacing_m
@@ -53,17 +67,18 @@ def register_edges(
     return _pose(best, points_m, rack, config, hint, intrinsics)
 
 
-def best_registration(points_m: FloatArray, rack: RackModel, config: Config) -> Registration | None:
+def best_registration(
+    points_m: FloatArray, found_levels: Iterable[list[Band]], rack: RackModel, config: Config, most: int | None = None
+) -> Registration | None:
     """The registration with most evidence of those that nothing contradicts, else of all; None where no band is found.
 
     The first one that sees much of the top is taken: only where little is seen can another place look like the rack.
+    Places that are worth much less than one that was accepted are not looked at, and no more than `most`.
     """
     found: list[Registration] = []
     worth = 0.0
-    for hypothesis in search(coarse_sample(points_m, config.rack_top), rack, config.rack_top):
-        if hypothesis.worth < RIVAL_WORTH * worth:
-            continue
-        if any(_same(hypothesis.T_camera_rack, other.fit.T_camera_rack, rack) for other in found):
+    for hypothesis in islice(search(found_levels, rack), most):
+        if hypothesis.worth < RIVAL_WORTH * worth or _known(hypothesis.T_camera_rack, found, rack):
             continue
         registration = register_at(points_m, hypothesis.T_camera_rack, rack, config.rack)
         if not registration.reason and registration.agreement.coverage >= config.rack.clear_seen:
@@ -71,19 +86,27 @@ def best_registration(points_m: FloatArray, rack: RackModel, config: Config) -> 
         registration = _level(registration, hypothesis.level, config.rack)
         if not registration.reason:
             worth = max(worth, hypothesis.worth)
-        if not any(_same(registration.fit.T_camera_rack, other.fit.T_camera_rack, rack) for other in found):
+        if not _known(registration.fit.T_camera_rack, found, rack):
             found.append(registration)
-    found.sort(key=lambda r: (bool(r.reason), -r.agreement.evidence))
+    return _likeliest(found, rack, config.rack)
+
+
+def _likeliest(found: list[Registration], rack: RackModel, config: RackConfig) -> Registration | None:
+    found = sorted(found, key=lambda r: (bool(r.reason), -r.agreement.evidence))
     if len(found) < 2 or found[1].reason:
         return found[0] if found else None
     best, next_best = (registration.agreement.evidence for registration in found[:2])
-    if best >= config.rack.min_rival_ratio * next_best:
+    if best >= config.min_rival_ratio * next_best:
         return found[0]
     reason = (
         f"two places look like {rack.name} (evidence {best:.0f} and {next_best:.0f} nats, a ratio of "
-        f"{config.rack.min_rival_ratio:g} expected): too little of its top is seen"
+        f"{config.min_rival_ratio:g} expected): too little of its top is seen"
     )
     return replace(found[0], reason=reason)
+
+
+def _known(T_camera_rack: FloatArray, found: list[Registration], rack: RackModel) -> bool:
+    return any(_same(T_camera_rack, other.fit.T_camera_rack, rack) for other in found)
 
 
 def _level(registration: Registration, level: FloatArray, config: RackConfig) -> Registration:
@@ -116,7 +139,7 @@ def register_at(points_m: FloatArray, T_camera_rack: FloatArray, rack: RackModel
     fit = refine(points_m, T_camera_rack, rack)
     agreement = measure_agreement(points_m, fit, rack, config)
     for _ in range(SLOT_STEPS):
-        if agreement.slot_margin >= 0:
+        if agreement.slot_margin >= 0 or agreement.in_slot > 2 * config.max_stray_share:
             break
         T_step = make_transform(np.eye(3), np.array([*agreement.step_m, 0.0]))
         farther = refine(points_m, fit.T_camera_rack @ T_step, rack)
@@ -179,5 +202,3 @@ def _not_found(points_m: FloatArray, rack: RackModel, config: RackConfig, closes
         spacing_m=spacing_m,
     )
 
-
-__all__ = ["Hypothesis", "Registration", "best_registration", "register_at", "register_edges"]

@@ -43,6 +43,8 @@ EDGE_SHIFT_M = 0.2e-3
 # Share of pixels that say the wrong thing wherever they are: bounds what one of them can do.
 WRONG_SHARE = 0.05
 LEAST_POINTS = 20
+# Variance of what nothing is known of.
+UNKNOWN = 1e6
 # Points this far inside the solid part are on the plane; nearer to an edge, pixels mix two depths.
 INSIDE_M = 0.3e-3
 # Points below this far are seen through the top: nearer ones may be mixed with it.
@@ -98,7 +100,7 @@ def top_frame(T_camera_rack: FloatArray, rack: RackModel) -> FloatArray:
 def refine(points_m: FloatArray, T_camera_rack: FloatArray, rack: RackModel) -> Fit:
     """Refine a coarse pose (2 mm and 1.5 degrees off at most) with points (N, 3), camera frame, metres."""
     field = top_field(rack)
-    state = _State(top_frame(T_camera_rack, rack), WIDEST_M, np.eye(6))
+    state = _State(top_frame(T_camera_rack, rack), WIDEST_M, UNKNOWN * np.eye(6))
     local = to_frame(points_m, state.T_camera_top)
     reach = rack.outline_m / 2 + 5e-3
     near = (np.abs(local[:, 2]) < 5e-3) & (np.abs(local[:, 0]) < reach[0]) & (np.abs(local[:, 1]) < reach[1])
@@ -127,7 +129,7 @@ def _step(
     local = local[np.abs(local[:, 2]) < max(window_m, float(widths_m[0]))]
     distance, slope, known = field.look_up(local[:, :2])
     local, distance, slope = local[known], distance[known], slope[known]
-    state.covariance = np.eye(6)
+    state.covariance = UNKNOWN * np.eye(6)
     move = np.zeros(6)
     inside = distance < -INSIDE_M
     if inside.sum() >= LEAST_POINTS:
@@ -192,6 +194,8 @@ def _balance(points_m: FloatArray) -> FloatArray:
 
 def _clustered(normal: FloatArray, scores: FloatArray, points_m: FloatArray) -> FloatArray:
     """Covariance of a fit whose residuals are alike within squares of `CLUSTER_M`, and independent between them."""
+    if len(points_m) == 0:
+        return UNKNOWN * np.eye(len(normal))
     cells = np.floor(points_m[:, :2] / CLUSTER_M).astype(np.intp)
     cells -= cells.min(axis=0)
     index = cells[:, 0] * (cells[:, 1].max() + 1) + cells[:, 1]

@@ -6,11 +6,10 @@ says "the view through the top is free there", a point above says nothing.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import fft
 
 from tubepose.config import RackTopConfig
@@ -130,13 +129,19 @@ def fit_plane(points_m: FloatArray) -> tuple[FloatArray, FloatArray]:
     return (-normal if normal @ centroid > 0 else normal), centroid
 
 
-def search(points_m: FloatArray, rack: RackModel, config: RackTopConfig) -> Iterator[Hypothesis]:
-    """Poses that a rack could have among points (N, 3), camera frame, metres: the likeliest first, the best placed.
+def levels(points_m: FloatArray, config: RackTopConfig) -> Iterator[list[Band]]:
+    """Bands of points (N, 3), camera frame, metres, one level direction after the other."""
+    for normal, origin in level_directions(points_m, config):
+        yield list(bands(points_m, normal, origin, config))
+
+
+def search(found_levels: Iterable[list[Band]], rack: RackModel) -> Iterator[Hypothesis]:
+    """Poses that a rack could have in the bands of `levels`: the likeliest first, the best placed.
 
     One level direction after the other is searched, so that whoever is content with the first answer is soon done.
     """
-    for normal, origin in level_directions(points_m, config):
-        found = [turn for band in bands(points_m, normal, origin, config) for turn in turns(band, rack, TURN_TRIES)]
+    for level in found_levels:
+        found = [turn for band in level for turn in turns(band, rack, TURN_TRIES)]
         found.sort(key=lambda turn: -turn.strength)
         for some in (found[:4], found[4:12], found[12:]):
             placed = []
@@ -217,13 +222,15 @@ def crossings(below_m: FloatArray, camera_m: FloatArray) -> FloatArray:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Turn:
+class Turn:
+    """An angle of the rack's x axis in a band, modulo half a turn, and how well its waves agree (1 at most)."""
+
     band: Band
     angle_rad: float
     strength: float
 
 
-def turns(band: Band, rack: RackModel, count: int) -> list[_Turn]:
+def turns(band: Band, rack: RackModel, count: int) -> list[Turn]:
     """Angles of the rack's x axis in a band (modulo half a turn), the best first, by the strength of its waves."""
     low, size = _frame(band.solid_m, rack, padded=False)
     if size > MOST_CELLS:
@@ -235,7 +242,7 @@ def turns(band: Band, rack: RackModel, count: int) -> list[_Turn]:
     found = []
     for _ in range(count):
         best = int(match.argmax())
-        found.append(_Turn(band, best * np.pi / TURNS, float(match[best])))
+        found.append(Turn(band, best * np.pi / TURNS, float(match[best])))
         match[np.arange(best - SAME_TURN, best + SAME_TURN + 1) % TURNS] = -1
     return found
 
@@ -261,7 +268,7 @@ def _raster(xy_m: FloatArray, low_m: FloatArray, size: int) -> FloatArray:
     return np.bincount(flat, minlength=size * size).reshape(size, size).astype(np.float32)
 
 
-def place(turn: _Turn, rack: RackModel) -> list[Hypothesis]:
+def place(turn: Turn, rack: RackModel) -> list[Hypothesis]:
     """Where the picture of the top lies best at one angle; for a top that half a turn changes, both ways round."""
     cos, sin = np.cos(turn.angle_rad), np.sin(turn.angle_rad)
     T_turned = np.array([[cos, -sin], [sin, cos]])

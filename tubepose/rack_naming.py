@@ -1,0 +1,106 @@
+"""Which rack of a catalogue stands there (`--rack auto`): every rack is registered, and the evidence compared."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+from tubepose.capture.frame import CameraIntrinsics
+from tubepose.capture.session import SlotHint
+from tubepose.config import Config
+from tubepose.labware import RackModel, catalogue
+from tubepose.rack_edges import Registration, best_registration, coarse_sample, pose_of
+from tubepose.rack_pose import MIN_POINTS, RackPose, RackStatus
+from tubepose.rack_search import levels
+from tubepose.transforms import FloatArray
+
+# Racks in a reason: the first ones tell enough.
+TOLD = 3
+# Places that are looked at per rack and level direction.
+PLACES = 5
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RankedRack:
+    """A rack and how well it fits.
+
+    Attributes:
+        rack: The rack.
+        evidence: How much likelier the points are with it than without any, nats; 0 without a registration.
+        reason: Why it is refused; empty if it fits.
+    """
+
+    rack: RackModel
+    evidence: float
+    reason: str
+
+
+def catalogue_racks() -> tuple[RackModel, ...]:
+    """Every rack of the built-in catalogue."""
+    return tuple(item for item in catalogue().values() if isinstance(item, RackModel))
+
+
+def name_rack(
+    points_m: FloatArray,
+    config: Config,
+    racks: Sequence[RackModel] | None = None,
+    hint: SlotHint | None = None,
+    intrinsics: CameraIntrinsics | None = None,
+) -> tuple[RackPose, tuple[RankedRack, ...]]:
+    """Find out which rack stands there, and its pose (always by method ``edges``).
+
+    A rack is named if it passes every test of `register_rack`, and its evidence is `rack.min_rival_ratio` times that of
+    the next rack that passes them too. `RackPose.rack` is the rack, `named_by_margin` how much its evidence beats that of
+    the next rack that passes, as a share of its own: 0 is no difference, 1 is that no other rack passes.
+
+    Args:
+        points_m: Array of shape (N, 3), camera frame, metres, without NaN: the rack's box or the whole frame.
+        config: Sections rack_top and rack are used.
+        racks: The racks that it can be; the whole catalogue if None.
+        hint: As for `register_rack`; left out where the rack has no such slot.
+        intrinsics: Of the hint's image.
+
+    Returns:
+        The pose, refused with the ranking in its reason where no rack can be named, and the ranking, best first.
+    """
+    racks = catalogue_racks() if racks is None else racks
+    if len(points_m) < MIN_POINTS:
+        reason = f"{len(points_m)} valid points on the rack, expected at least {MIN_POINTS}"
+        return RackPose(RackStatus.INSUFFICIENT, reason), ()
+    found = _registrations(points_m, racks, config)
+    order = sorted(found, key=lambda pair: _rank(pair[1]))
+    ranking = tuple(RankedRack(rack, best.agreement.evidence, best.reason) for rack, best in order)
+    if not ranking or ranking[0].reason:
+        told = "; ".join(f"{entry.rack.name}: {entry.reason}" for entry in ranking[:TOLD]) or "no level band at all"
+        return RackPose(RackStatus.REFUSED, f"no rack of the {len(racks)} known ones fits; the nearest are {told}"), ranking
+    rack, best = order[0]
+    rival = max((entry.evidence for entry in ranking[1:] if not entry.reason), default=0.0)
+    if ranking[0].evidence < config.rack.min_rival_ratio * rival:
+        told = ", ".join(f"{entry.rack.name} ({entry.evidence:.0f} nats)" for entry in ranking[:TOLD])
+        reason = f"more than one rack fits: {told}; a ratio of {config.rack.min_rival_ratio:g} expected: name it"
+        return RackPose(RackStatus.REFUSED, reason), ranking
+    if hint is not None and hint.slot not in {slot.name for slot in rack.all_slots}:
+        hint = None
+    pose = pose_of(best, points_m, rack, config, hint, intrinsics)
+    return replace(pose, rack=rack, named_by_margin=1 - rival / ranking[0].evidence), ranking
+
+
+def _registrations(
+    points_m: FloatArray, racks: Sequence[RackModel], config: Config
+) -> list[tuple[RackModel, Registration]]:
+    """The best registration of every rack that has one, at the first level direction at which a rack is accepted."""
+    best: dict[str, Registration] = {}
+    for level in levels(coarse_sample(points_m, config.rack_top), config.rack_top):
+        for rack in racks:
+            found = best_registration(points_m, [level], rack, config, PLACES)
+            before = best.get(rack.name)
+            if found is not None and (before is None or _rank(found) < _rank(before)):
+                best[rack.name] = found
+        if any(not found.reason for found in best.values()):
+            break
+    return [(rack, best[rack.name]) for rack in racks if rack.name in best]
+
+
+def _rank(registration: Registration) -> tuple[bool, float]:
+    """Smaller is better: accepted before refused, then more evidence."""
+    return bool(registration.reason), -registration.agreement.evidence
