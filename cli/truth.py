@@ -40,7 +40,10 @@ class MeasuredTruth:
 def measure_sessions(
     folders: Sequence[Path], out: Path, *, exact: bool = False, fail_fast: bool = False
 ) -> MeasuredTruth:
-    """Measure all sessions (or take the exact poses of simulated ones) and write ground_truth.csv (and ground_truth_floor.csv if one is simulated) into `out`."""
+    """Measure all sessions, or take the exact poses of simulated ones, and write ground_truth.csv into `out`.
+
+    ground_truth_floor.csv is written too if one that was measured is simulated.
+    """
     from dataclasses import asdict
 
     from tubepose.capture.session import load_session

@@ -14,7 +14,7 @@ CLI = ROOT / "cli"
 
 # Everyone may use these; they use nothing of ours but one another.
 BASE = {"errors", "transforms"}
-STAGES = {"rack", "rack_acceptance", "slots", "tube", "pipeline", "baselines", "rivals", "detection"}
+STAGES = {"rack", "rack_acceptance", "slots", "tube", "profile", "pipeline", "baselines", "rivals", "detection"}
 
 # Part of the library -> the other parts that it may import (BASE goes without saying).
 ALLOWED: dict[str, set[str]] = {
@@ -47,6 +47,7 @@ ALLOWED: dict[str, set[str]] = {
     "rack": {"capture", "config", "labware", "preprocessing", "rack_acceptance", "rack_edges", "rack_obb", "rack_pose"},
     "slots": {"config", "labware", "preprocessing", "detection", "rack"},
     "tube": {"config", "labware", "preprocessing", "slots"},
+    "profile": {"capture", "config", "labware", "tube"},
     "baselines": {"config", "labware", "preprocessing", "slots", "tube"},
     "rivals": {"config", "labware", "tube", "baselines"},
     "pipeline": {
@@ -58,16 +59,18 @@ ALLOWED: dict[str, set[str]] = {
         "rack",
         "slots",
         "tube",
+        "profile",
         "baselines",
         "rivals",
     },
-    "records": {"pipeline"},
+    "records": {"pipeline", "pose_errors"},
     "batch": {"capture", "config", "labware", "detection", "rack", "pipeline", "records"},
     "ground_truth": {"capture", "labware"},
     "simulation": {"capture", "labware"},
     "statistics": set(),
     "pose_errors": set(),
     "evaluation": {"labware", "pose_errors", "statistics"},
+    "uncertainty": {"pose_errors", "statistics"},
     "truth_tables": {
         "batch",
         "records",

@@ -134,15 +134,15 @@ def test_every_frame_of_a_recording_has_its_rows() -> None:
     assert occupied == [(0, "B2"), (1, "A1"), (1, "C4")]
 
 
-def test_pictures_show_the_papers_method_if_it_ran() -> None:
+def test_pictures_show_our_method_if_it_ran() -> None:
     seen: list[str] = []
 
     def keep(job: Job, scene: Any, estimates: Any) -> None:
         seen.extend(estimate.method for estimate in estimates)
 
-    run(job("good", GOOD), methods=("upright", "paper"), on_scene=keep)
+    run(job("good", GOOD), methods=("upright", "profile"), on_scene=keep)
     run(job("good", GOOD), methods=("upright", "slot-icp"), on_scene=keep)
-    assert seen == ["paper", "upright"]
+    assert seen == ["profile", "upright"]
 
 
 def test_the_rows_fit_the_columns() -> None:

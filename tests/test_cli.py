@@ -402,8 +402,8 @@ def test_gt_keeps_its_problems_in_the_record(small_session: Path, tmp_path: Path
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (("--method", "papr"), "unknown method 'papr'; did you mean 'paper'?; known: paper, upright"),
-        (("--method", ","), "no method is named; expected one or more of paper"),
+        (("--method", "papr"), "unknown method 'papr'; did you mean 'paper'?; known: profile, paper, upright"),
+        (("--method", ","), "no method is named; expected one or more of profile, paper"),
         (("--detector", "geometrc"), "unknown detector 'geometrc'; did you mean 'geometric'?; known: geometric, yolo"),
         (("--detector", "recorded"), "--detector recorded needs --boxes PATH"),
         (("--detector", "recorded", "--boxes", "none"), "none: no such file or folder; expected a COCO .json"),
@@ -636,6 +636,7 @@ def test_boxes_from_elsewhere_give_the_same_slots(
     ended = tubepose(
         "estimate", original(small_session), *KNOWN, "--detector", source, *place, "--no-overlays",
         "--hint", f"{hint['slot']}@{hint['pixel'][0]},{hint['pixel'][1]}", "--out", tmp_path / "out",
+        "--method", "paper",
     )  # fmt: skip
     assert (ended.code, ended.errors, "ambiguous" in ended.err) == (0, [], False)
     slots, wanted = table(tmp_path / "out" / "slots.csv"), table(estimated[0] / "slots.csv")

@@ -11,7 +11,7 @@ from tubepose.config import Config
 from tubepose.detection import Detection
 from tubepose.detection.geometric import GeometricDetector
 from tubepose.labware import load_rack, load_tube
-from tubepose.pipeline import DEFAULT_METHOD, METHODS, STOCHASTIC, estimate_tubes, prepare_scene
+from tubepose.pipeline import DEFAULT_METHOD, METHODS, STOCHASTIC, TUBE_METHODS, estimate_tubes, prepare_scene
 from tubepose.rack import RackStatus
 from tubepose.rivals import PACKAGES
 from tubepose.transforms import make_transform, tilt_rad, transform_points
@@ -66,7 +66,8 @@ def scene():
 
 def test_the_rivals_and_ours_have_their_names():
     assert set(METHODS) >= {"paper", "upright", "slot-icp", "global-icp", "kiss-matcher", "gicp"}
-    assert DEFAULT_METHOD in METHODS
+    assert METHODS == ("profile", *TUBE_METHODS)
+    assert DEFAULT_METHOD == "profile"
     assert set(METHODS) >= STOCHASTIC == {"global-icp", "kiss-matcher"}
 
 
@@ -89,7 +90,7 @@ def test_the_paper_recovers_the_poses_in_both_frames(scene):
         assert np.allclose(estimate.T_camera_tube, scene.rack_pose.T_camera_rack @ estimate.pose.T_rack_tube)
 
 
-@pytest.mark.parametrize("method", sorted(METHODS))
+@pytest.mark.parametrize("method", sorted(TUBE_METHODS))
 def test_every_method_answers_for_every_target_once(scene, method):
     for package in PACKAGES.get(method, ()):
         pytest.importorskip(package, reason="an extra: pip install 'tubepose[rivals]'")
@@ -198,7 +199,7 @@ def test_a_target_that_no_method_can_be_asked_is_rejected_with_its_reason():
     )
     found = prepare(scenes.unorganised(points), detector=detector)
     assert found.targets[0].slot is None
-    for method in METHODS:
+    for method in TUBE_METHODS:
         (estimate,), times = estimate_tubes(found, method, CONFIG, 0)
         assert estimate.pose.status is TubeStatus.REJECTED
         assert "lies across the rack?" in estimate.pose.reason

@@ -200,8 +200,10 @@ def estimate_tubes(
 
 def _estimate(scene: Scene, method: str, seed: int | None, target: TubeTarget, pose: TubePose) -> TubeEstimate:
     T_camera_rack = scene.rack_pose.T_camera_rack
-    known = pose.T_rack_tube is not None and T_camera_rack is not None
-    return TubeEstimate(method, seed, target, pose, T_camera_rack @ pose.T_rack_tube if known else None)
+    T_camera_tube = None
+    if pose.T_rack_tube is not None and T_camera_rack is not None:
+        T_camera_tube = T_camera_rack @ pose.T_rack_tube
+    return TubeEstimate(method, seed, target, pose, T_camera_tube)
 
 
 def _profile_estimates(scene: Scene, config: Config) -> tuple[tuple[TubeEstimate, ...], tuple[StageTime, ...]]:
@@ -231,7 +233,7 @@ def _profile_target(tube: ProfileTube) -> TubeTarget:
 
 
 def allowed_types(scene: Scene) -> NDArray[np.bool_] | None:
-    """Which type may stand in which slot, shape (K, S), as far as a detector's classes say; None where they say nothing.
+    """Which type may stand in which slot, shape (K, S), as far as a detector's classes say; None without a word.
 
     A box of a known class speaks for the slot whose tube's top, upright, is seen nearest to the box's middle.
     """

@@ -14,7 +14,8 @@ from tubepose.statistics import coverage_curve
 REGION = 0.95
 ALL_TUBES = "all"
 UNCERTAINTY_COLUMNS = (
-    "method", "tube", "n", "inside_95", "mahalanobis2_mean", "tilt_deg_all", "tilt_deg_best_half", "tilt_deg_worst_half",
+    "method", "tube", "n", "inside_95", "mahalanobis2_mean",
+    "tilt_deg_all", "tilt_deg_best_half", "tilt_deg_worst_half",
 )  # fmt: skip
 COVERAGE_COLUMNS = ("method", "tube", "coverage", "score", "tilt_deg_mean", "tilt_deg_max")
 SHARES = (1.0, 0.9, 0.8, 0.7, 0.6, 0.5, 0.4, 0.3, 0.2, 0.1)
@@ -27,9 +28,9 @@ def uncertainty(errors: pd.DataFrame) -> pd.DataFrame:
         errors: Rows of errors.csv; only those that are ``ok`` count.
 
     Returns:
-        Rows of uncertainty.csv: share of the truths inside the 95 % region of the five stated errors, mean of their squared
-        Mahalanobis distances (5 if honest), and the mean tilt error of all answers and of the half with the higher
-        scores; the tube ``all`` stands for all together.
+        Rows of uncertainty.csv: share of the truths inside the 95 % region of the five stated errors, mean of their
+        squared Mahalanobis distances (5 if honest), and the mean tilt error of all answers and of the halves with the
+        higher and the lower scores; the tube ``all`` stands for all together.
     """
     rows: list[dict[str, Any]] = []
     limit = float(chi2.ppf(REGION, len(COVARIANCE_AXES)))

@@ -1,4 +1,4 @@
-"""What stands or lies on a rack and is no tube that is looked for: unknown types, tubes across the rack, second tubes."""
+"""What stands or lies on a rack and is no tube that is looked for: unknown types, tubes across it, second tubes."""
 
 from __future__ import annotations
 
@@ -16,6 +16,9 @@ from tubepose.transforms import FloatArray
 CELL_M = 1.0e-3
 CORE_SHARE = 0.6
 """Least filled share of a slot's middle for something to stand in it."""
+LEVEL_M = 2.5e-3
+LEVEL_SHARE = 0.6
+"""A top is level: this share of its points lies this near their median height. Light behind glass is not."""
 LYING_PITCHES = 1.6
 """Something longer than this many pitches stands in no slot."""
 
@@ -84,7 +87,8 @@ def _judge(
     """What one group is; None if it is too small to be anything."""
     (_, _), sides, _ = cv2.minAreaRect(cells.astype(np.float32))
     length_m, width_m = max(sides) * CELL_M, min(sides) * CELL_M
-    height_m = float(np.percentile(standing.points_m[rows, 2], 95)) - rack.floor_m
+    z = standing.points_m[rows, 2]
+    height_m = float(np.percentile(z, 95)) - rack.floor_m
     if length_m > LYING_PITCHES * pitch_m and width_m > 6e-3:
         return Leftover(
             None, f"lies across the rack: {length_m * 1e3:.0f} x {width_m * 1e3:.0f} mm seen from above", rows
@@ -94,6 +98,8 @@ def _judge(
     slot = int(distance.argmin())
     area_m2 = len(cells) * CELL_M**2
     if area_m2 < CORE_SHARE * np.pi * (0.3 * pitch_m) ** 2 or distance[slot] > 0.6 * pitch_m:
+        return None
+    if np.mean(np.abs(z - np.median(z)) < LEVEL_M) < LEVEL_SHARE:
         return None
     if slot in taken:
         if area_m2 < np.pi * (0.3 * pitch_m) ** 2:
