@@ -41,6 +41,9 @@ def bench(
         bool,
         typer.Option("--exact-truth", help="Judge by the exact poses of the simulation, not by measured printed caps."),
     ] = False,
+    all_tubes: Annotated[
+        bool, typer.Option("--all-tubes", help="Any of a session's types may stand in any trial: tells types apart.")
+    ] = False,
     published: Annotated[bool, typer.Option("--published", help="Add the paper's own figures to the tables.")] = False,
     fail_fast: Annotated[bool, typer.Option("--fail-fast", help="Stop at the first bad capture.")] = False,
 ) -> None:
@@ -49,6 +52,8 @@ def bench(
     Writes what estimate and gt write, and errors.csv, summary.csv, comparison.csv, seeds.csv,
     table_accuracy.{csv,md,tex} and table_timing.{csv,md,tex} into --out.
     """
+    from dataclasses import replace
+
     from tubepose.batch import session_jobs
     from tubepose.config import load_config
     from tubepose.errors import TubePoseError
@@ -67,6 +72,8 @@ def bench(
     for session in measured.sessions:
         try:
             found, unread = session_jobs(session, fail_fast=fail_fast)
+            if all_tubes:
+                found = [replace(job, tubes=tuple(session.tubes.values())) for job in found]
             jobs += with_exact_rack(found, session) if known_rack else found
             problems += unread
         except TubePoseError as problem:
@@ -93,6 +100,7 @@ def _report(
     seeds: int, published: bool,
 ) -> None:  # fmt: skip
     """Evaluate, write and print."""
+    from tubepose.confusion import confusion
     from tubepose.evaluation import compare, evaluate, seed_spread, slot_accuracy, summarise
     from tubepose.pipeline import STOCHASTIC
     from tubepose.records import ESTIMATE_COLUMNS, SLOT_COLUMNS, TIMING_COLUMNS, to_table
@@ -111,11 +119,12 @@ def _report(
     write_csv(out / "comparison.csv", compare(errors, reference))
     write_csv(out / "uncertainty.csv", uncertainty(errors))
     write_csv(out / "coverage.csv", coverage(errors))
+    write_csv(out / "confusion.csv", confusion(errors))
     write_csv(out / "seeds.csv", seed_spread(errors))
     slots = slot_accuracy(to_table(tables.slots, SLOT_COLUMNS), measured.truth)
     write_csv(out / "slot_accuracy.csv", slots)
     notes = [_data_note(measured, jobs), *measured.notes, *_rack_notes(tables), *_slot_notes(slots)]
-    notes += _uncertainty_notes(errors)
+    notes += [*_uncertainty_notes(errors), *_confusion_notes(errors)]
     notes += _rival_notes(methods, config, seeds)
     if any(method in STOCHASTIC for method in methods):
         notes += _spread_notes(seed_spread(errors))
@@ -153,6 +162,16 @@ def _slot_notes(slots: pd.DataFrame) -> list[str]:
         )
         told.setdefault(words, []).append(str(row["method"]))
     return [f"Slots ({', '.join(methods)}): {words}." for words, methods in told.items()] or ["Slots: none judged."]
+
+
+def _confusion_notes(errors: pd.DataFrame) -> list[str]:
+    """Types that were taken for others, where more than one could stand in a trial."""
+    from tubepose.confusion import confusion
+
+    rows = confusion(errors).to_dict("records")
+    wrong = [row for row in rows if row["tube_estimated"] not in (row["tube"], "none")]
+    told = "; ".join(f"{r['method']}: {r['n']} {r['tube']} taken for {r['tube_estimated']}" for r in wrong)
+    return [f"Types taken for others: {told}."] if told else []
 
 
 def _uncertainty_notes(errors: pd.DataFrame) -> list[str]:

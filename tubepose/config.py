@@ -211,7 +211,7 @@ class ProfileConfig(_Section):
     rim_depth_m: float = 3.5e-3
     min_support: float = 0.3
     min_rim_support: float = 0.1
-    min_rim_evidence: float = 0.08
+    min_rim_evidence: float = 0.11
     min_sectors: float = 0.4
     reach_m: float = 1.5e-3
     plane_points: int = 400

@@ -13,13 +13,11 @@ from tubepose.config import Config, ProfileConfig
 from tubepose.labware import RackModel, TubeModel
 from tubepose.profile.leftovers import Leftover, find_leftovers
 from tubepose.profile.measure import Measured, measure_tops
-from tubepose.profile.posterior import Evidence, Posterior, combine, evidence, pivot_m
+from tubepose.profile.posterior import FEW_SAMPLES, Evidence, Posterior, combine, evidence, per_model, pivot_m
 from tubepose.profile.verdict import rejection, score
 from tubepose.profile.wall import wall_evidence
 from tubepose.transforms import FloatArray, axis_rotation, make_transform
 from tubepose.tube import TubePose, TubeStatus
-
-WALL_ROUNDS = 2
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -91,22 +89,20 @@ def fit_profiles(
 
 
 def fuse(measured: Measured, models: Sequence[TubeModel], rack: RackModel, config: ProfileConfig) -> Posterior:
-    """Axes from tops, slots and walls; the walls' points are looked up again where the axis has moved to."""
+    """Axes from tops and slots, then from the walls near them too."""
     slots = [rack.all_slots[i] for i in measured.tops.slot]
     centers = rack.slot_centers_m[measured.tops.slot]
     tops = top_evidence(measured, models, rack, config)
-    found = combine(tops, slots, models, rack, config)
-    for _ in range(WALL_ROUNDS):
-        walls = wall_evidence(measured.points, measured.label, found.mean, centers, models, rack, config)
-        found = combine(tops + walls, slots, models, rack, config)
-    return found
+    start = combine(tops, slots, models, rack, config, FEW_SAMPLES)
+    walls = wall_evidence(measured.points, measured.label, start.mean, centers, models, rack, config)
+    return combine(tops + walls, slots, models, rack, config)
 
 
 def top_evidence(measured: Measured, models: Sequence[TubeModel], rack: RackModel, config: ProfileConfig) -> Evidence:
-    """What tops say of axes: the axis goes through the circle's middle and, but for the cap's seat, along the normal."""
+    """What tops say of axes: the axis through the circle's middle, along the normal but for the cap's seat."""
     count = len(models)
     centers = rack.slot_centers_m[measured.tops.slot]
-    lever = measured.level_m - rack.floor_m - np.array([pivot_m(tube) for tube in models])
+    lever = measured.level_m - rack.floor_m - per_model(models, pivot_m)
     through = np.zeros((count, 2, 4))
     through[:, [0, 1], [0, 1]] = 1.0
     through[:, [0, 1], [2, 3]] = lever[:, None]
@@ -119,8 +115,8 @@ def top_evidence(measured: Measured, models: Sequence[TubeModel], rack: RackMode
 
 
 def _rise_m(measured: Measured, models: Sequence[TubeModel], rack: RackModel, config: ProfileConfig) -> FloatArray:
-    """How far each tube stands above the slot's floor, shape (T,), metres: the floor's height and a closed top's, weighed."""
-    expected = rack.floor_m + np.array([tube.height_m for tube in models])
+    """How far tubes stand above the floor, shape (T,), metres: the floor's height and a closed top's, weighed."""
+    expected = rack.floor_m + per_model(models, lambda tube: tube.height_m)
     seen = np.nan_to_num(measured.planes.height_m - expected)
     return np.asarray(seen * _rise_gain(measured, rack, config))
 
@@ -146,8 +142,8 @@ def pose_covariance(
     shifts the bottom, and turns the axis by that shift over the distance between them.
     """
     count = len(models)
-    held = np.array([pivot_m(tube) for tube in models])
-    height = np.array([tube.height_m for tube in models])
+    held = per_model(models, pivot_m)
+    height = per_model(models, lambda tube: tube.height_m)
     J = np.zeros((count, 5, 4))
     J[:, 0, 3], J[:, 1, 2] = -1.0, 1.0
     J[:, [2, 3], [0, 1]] = 1.0
@@ -184,7 +180,8 @@ def _pose(
     slot = rack.all_slots[measured.tops.slot[i]]
     axis = np.array([a, b, 1.0]) / np.sqrt(1 + a * a + b * b)
     held = pivot_m(tube)
-    bottom = np.array([*(slot.center_m + (u, v)), rack.floor_m + held + rise_m]) - held * axis
+    x, y = slot.center_m
+    bottom = np.array([x + u, y + v, rack.floor_m + held + rise_m]) - held * axis
     tilt_std = float(np.sqrt(np.trace(covariance[:2, :2])))
     high = float(measured.planes.height_m[i] - rack.floor_m - tube.height_m)
     sectors, allowed = float(measured.circles.sectors[i]), float(posterior.allowed[i])

@@ -7,12 +7,11 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from tubepose.capture.frame import CameraIntrinsics, RgbdFrame
 from tubepose.config import Config, ProfileConfig
 from tubepose.labware import RackModel, TubeModel
-from tubepose.profile.outline import NORMALS, Circles, fit_discs, unknown_circles
+from tubepose.profile.outline import NORMALS, OUTLINE_DEPTH_M, Circles, fit_discs, unknown_circles
 from tubepose.profile.plane import TopPlanes, fit_top_planes
 from tubepose.profile.rims import fit_rims
 from tubepose.profile.standing import Standing, gather_standing
@@ -25,6 +24,7 @@ ON_PLANE_M = 5.0e-4
 DISC_GAP_M = 0.9e-3
 RIM_GAP_M = 0.6e-3
 """Where another top is nearer than this, the end of a disc (the ring of a rim) is not told from the other's."""
+LABEL_CELL_M = 5.0e-4
 NEAR_TOP_M = 2.5e-3
 """Points this far outside of a top can be of the wall below it."""
 
@@ -84,7 +84,9 @@ def measure_tops(
     tops = find_tops(standing, rack, tubes, config.profile, allowed)
     shape = _shapes(tops, tubes, rack)
     rims = _measure_rims(frame, intrinsics, T_camera_rack, tops, shape, config.profile)
-    kept = ~shape.open | (rims.sectors >= config.profile.min_rim_sectors) | (tops.support >= config.profile.min_support)
+    # A rim of clear plastic has few points, and other things look like one in the image: both together must speak for it.
+    measured = np.isfinite(rims.widening_m)
+    kept = ~shape.open | ~measured | (rims.sectors * tops.support >= config.profile.min_rim_evidence)
     tops, shape, rims = tops.take(kept), shape.take(kept), rims.take(kept)
     label = label_points(standing, tops.center_m, shape.radius_m)
     planes, discs = _measure_closed(standing, label, tops, shape, config.profile)
@@ -134,15 +136,31 @@ def _measure_rims(
 
 
 def label_points(standing: Standing, center_m: FloatArray, radius_m: FloatArray) -> NDArray[np.intp]:
-    """Tube whose top is nearest to each point from above, shape (N,); -1 farther than `NEAR_TOP_M` from all."""
-    if len(center_m) == 0:
+    """Tube whose top is nearest to each point from above, shape (N,); -1 farther than `NEAR_TOP_M` from all.
+
+    Looked up in a picture of the rack from above, in cells of `LABEL_CELL_M`: half a cell does not matter, as tops that
+    nearly touch are not measured where they do.
+    """
+    if len(center_m) == 0 or len(standing.points_m) == 0:
         return np.full(len(standing.points_m), -1)
-    distance, nearest = cKDTree(center_m).query(
-        standing.points_m[:, :2], distance_upper_bound=radius_m.max() + NEAR_TOP_M
-    )
-    found = np.isfinite(distance)
-    label = np.where(found, nearest, 0)
-    return np.where(found & (distance < radius_m[label] + NEAR_TOP_M), label, -1)
+    reach = float(radius_m.max()) + NEAR_TOP_M + LABEL_CELL_M
+    low = center_m.min(axis=0) - 2 * reach
+    size = np.ceil((np.ptp(center_m, axis=0) + 4 * reach) / LABEL_CELL_M).astype(int) + 1
+    label = np.full(size, -1)
+    nearest = np.full(size, np.inf)
+    width = int(np.ceil(reach / LABEL_CELL_M))
+    for i, (center, radius) in enumerate(zip(center_m, radius_m, strict=True)):
+        at = np.rint((center - low) / LABEL_CELL_M).astype(int)
+        x, y = (low[k] + np.arange(at[k] - width, at[k] + width + 1) * LABEL_CELL_M - center[k] for k in (0, 1))
+        window = np.s_[at[0] - width : at[0] + width + 1, at[1] - width : at[1] + width + 1]
+        distance = np.hypot(x[:, None], y[None, :])
+        closer = (distance < nearest[window]) & (distance < radius + NEAR_TOP_M)
+        label[window][closer] = i
+        nearest[window][closer] = distance[closer]
+    cells = np.rint((standing.points_m[:, :2] - low) / LABEL_CELL_M).astype(np.intp)
+    np.clip(cells, 0, size - 1, out=cells)
+    # The picture's border belongs to no top.
+    return np.asarray(label.reshape(-1)[cells[:, 0] * size[1] + cells[:, 1]])
 
 
 def blocked_sectors(
@@ -163,14 +181,21 @@ def blocked_sectors(
 def _measure_closed(
     standing: Standing, label: NDArray[np.intp], tops: Tops, shape: _Shapes, config: ProfileConfig
 ) -> tuple[TopPlanes, Circles]:
-    """Planes and circles of the closed tops; unknown for the others."""
-    mine = np.flatnonzero((label >= 0) & ~np.append(shape.open, True)[label])
-    points, of = standing.take(mine), label[mine]
-    offset = points.points_m[:, :2] - tops.center_m[of]
-    planes = fit_top_planes(of, offset, points.points_m[:, 2], shape.level_m, shape.radius_m, config)
-    height = planes.height_at(of, offset)
+    """Planes and circles of the closed tops; unknown for the others.
+
+    A circle needs the points near its end alone.
+    """
+    closed = np.append(~shape.open, False)
+    near_m = np.abs(standing.points_m[:, 2] - np.append(shape.level_m, np.inf)[label])
+    mine = np.flatnonzero(closed[label] & (near_m < config.top_band_m))
+    of, points_m = label[mine], standing.points_m[mine]
+    offset = points_m[:, :2] - tops.center_m[of]
+    planes = fit_top_planes(of, offset, points_m[:, 2], shape.level_m, shape.radius_m, config)
+    outer = np.flatnonzero(np.einsum("ij,ij->i", offset, offset) > (shape.radius_m - OUTLINE_DEPTH_M)[of] ** 2)
+    of, points_m = of[outer], points_m[outer]
+    height = planes.height_at(of, offset[outer])
     with np.errstate(invalid="ignore"):
-        on = np.flatnonzero(np.abs(points.points_m[:, 2] - height) < ON_PLANE_M)
-    flat = points.take(on).on_level(height[on]) - tops.center_m[of[on]]
+        on = np.flatnonzero(np.abs(points_m[:, 2] - height) < ON_PLANE_M)
+    flat = standing.on_level(height[on], points_m[on]) - tops.center_m[of[on]]
     blocked = blocked_sectors(tops.center_m, shape.radius_m, DISC_GAP_M)
     return planes, fit_discs(of[on], flat, shape.radius_m, blocked, config)

@@ -18,10 +18,15 @@ from tubepose.transforms import FloatArray
 SECTORS = 24
 ANGLES = (np.arange(SECTORS) + 0.5) / SECTORS * 2 * np.pi - np.pi
 NORMALS: FloatArray = np.column_stack([np.cos(ANGLES), np.sin(ANGLES)])
-WIDTHS_M = ((2.5e-3, 2.0e-3), (1.2e-3, 1.2e-3), (0.8e-3, 0.9e-3))
+WIDTHS_M = ((2.0e-3, 2.0e-3), (1.2e-3, 1.2e-3), (0.8e-3, 0.9e-3))
 """How far inside and outside of the circle a sector's end is looked for, round by round."""
-DENSITY_BAND_M = 1.5e-3
+DENSITY_BAND_M = 1.0e-3
 """The ring inside of that, where the density of points is taken from."""
+COARSE_BAND_M = 2.5e-3
+MIN_CORE_POINTS = 6.0
+"""A coarse scan has no more points than this of a sector in that ring: it gets a wider one, and less trust."""
+OUTLINE_DEPTH_M = WIDTHS_M[0][0] + COARSE_BAND_M
+"""Points farther inside of a circle than this do not count, the start's own error included."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -89,10 +94,9 @@ def fit_discs(
     shift = np.zeros((count, 2))
     circles = None
     for inside_m, outside_m in WIDTHS_M:
-        end_m, seen = _sector_ends(label, offset_m - shift[label], radius_m, inside_m, outside_m)
-        circles = fit_circles(
-            end_m - radius_m[:, None], seen & ~blocked, config, config.outline_noise_m, config.outline_bias_m
-        )
+        end_m, seen, counting_m = _sector_ends(label, offset_m - shift[label], radius_m, inside_m, outside_m)
+        sigma_m = np.hypot(config.outline_noise_m, counting_m)
+        circles = fit_circles(end_m - radius_m[:, None], seen & ~blocked, config, sigma_m, config.outline_bias_m)
         shift += np.nan_to_num(circles.offset_m)
     assert circles is not None
     return Circles(
@@ -105,38 +109,55 @@ def fit_discs(
 
 def _sector_ends(
     label: NDArray[np.intp], offset_m: FloatArray, radius_m: FloatArray, inside_m: float, outside_m: float
-) -> tuple[FloatArray, NDArray[np.bool_]]:
+) -> tuple[FloatArray, NDArray[np.bool_], FloatArray]:
     """Radius at which each sector ends, shape (T, SECTORS), metres, and whether it is filled up to there.
 
-    The end is where the points of the sector would end if they lay as dense as those further in.
+    The end is where the points of the sector would end if they lay as dense as those further in. The last is what
+    counting few points adds to its error, shape (T,), metres: 0 but in a coarse scan.
     """
     count = len(radius_m)
     rho = np.hypot(*offset_m.T)
     sector = ((np.arctan2(offset_m[:, 1], offset_m[:, 0]) + np.pi) / (2 * np.pi) * SECTORS).astype(np.intp) % SECTORS
     place = label * SECTORS + sector
-    low = radius_m - inside_m
-    lower = low - DENSITY_BAND_M
-    r, lo, lr = rho, low[label], lower[label]
-    core = np.bincount(place[(r > lr) & (r <= lo)], minlength=count * SECTORS).reshape(count, SECTORS)
-    edge = (r > lo) & (r <= (radius_m + outside_m)[label])
-    counted = np.bincount(place[edge], minlength=count * SECTORS).reshape(count, SECTORS)
     width = 2 * np.pi / SECTORS
-    core_area = 0.5 * width * (low**2 - lower**2)
-    density = np.median(core, axis=1) / core_area
+    low = radius_m - inside_m
+
+    def between(inner_m: FloatArray, outer_m: FloatArray) -> NDArray[np.intp]:
+        chosen = (rho > inner_m[label]) & (rho <= outer_m[label])
+        return np.bincount(place[chosen], minlength=count * SECTORS).reshape(count, SECTORS)
+
+    counted = between(low, radius_m + outside_m)
+    lower = low - DENSITY_BAND_M
+    core = between(lower, low)
+    usual = np.median(core, axis=1)
+    coarse = usual <= MIN_CORE_POINTS
+    if coarse.any():
+        lower = np.where(coarse, low - COARSE_BAND_M, lower)
+        core = between(lower, low)
+        filled = core > 0.5 * np.median(core, axis=1)[:, None]
+        mean = (core * filled).sum(axis=1) / np.maximum(filled.sum(axis=1), 1)
+        usual = np.where(coarse, mean, usual)
+    density = usual / (0.5 * width * (low**2 - lower**2))
     with np.errstate(divide="ignore", invalid="ignore"):
         end = np.sqrt(low[:, None] ** 2 + 2 * counted / (width * density[:, None]))
-        seen = (core > 0.8 * (density * core_area)[:, None]) & (density * core_area > 3)[:, None]
-    return np.where(seen, end, np.nan), seen
+        counting = 0.5 * np.sqrt(inside_m / (width * density * radius_m))
+    seen = (core > (np.where(coarse, 0.5, 0.8) * usual)[:, None]) & (usual > MIN_CORE_POINTS / 3)[:, None]
+    return np.where(seen, end, np.nan), seen, np.where(coarse & (density > 0), counting, 0.0)
 
 
 def fit_circles(
-    excess_m: FloatArray, seen: NDArray[np.bool_], config: ProfileConfig, sigma: float, bias_m: float
+    excess_m: FloatArray,
+    seen: NDArray[np.bool_],
+    config: ProfileConfig,
+    sigma_m: float | FloatArray,
+    bias_m: float,
 ) -> Circles:
     """Offset and widening of circles from the excess radius of their sectors, shape (T, SECTORS), metres.
 
     A projector at one side blurs a circle's ends less along the baseline than across it, which looks like an ellipse:
-    two more unknowns with a prior. Weights are Huber's.
+    two more unknowns with a prior. Weights are Huber's. The noise `sigma_m` is one for all circles or one each, (T,).
     """
+    sigma = np.broadcast_to(np.asarray(sigma_m), len(excess_m))[:, None]
     design = np.column_stack([NORMALS, np.ones(SECTORS), np.cos(2 * ANGLES), np.sin(2 * ANGLES)])
     prior = np.diag([0.0, 0.0, 1 / config.widening_m**2, 1 / config.widening_m**2, 1 / config.widening_m**2])
     value = np.where(seen, excess_m, 0.0)

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from tubepose.config import ProfileConfig
 from tubepose.transforms import FloatArray
 
-ROUNDS = 5
+ROUNDS = 4
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -46,6 +46,8 @@ def fit_top_planes(
 ) -> TopPlanes:
     """Fit the planes of all tops at once: least squares with Tukey's weights, from the median height.
 
+    The rounds see `plane_points` of a top's points, the last one all of them.
+
     The variance of a slope has two parts: the noise of single points, which many points average out, and the error
     that points within `shared_error_reach_m` share, which they do not.
 
@@ -61,17 +63,18 @@ def fit_top_planes(
     inside = np.hypot(*offset_m.T) < radius_m[label] - 1e-3
     inside &= np.abs(height_m - expected_m[label]) < config.top_band_m
     label, xy, z = label[inside], offset_m[inside], height_m[inside]
-    start = _median_per_label(label, z, expected_m)
+    step = max(1, len(z) // max(config.plane_points * count, 1))
+    start = _median_per_label(label[::step], z[::step], expected_m)
     coefficients = np.column_stack([start, np.zeros((count, 2))])
     sigma = np.full(count, config.top_band_m / 3)
-    basis = np.column_stack([np.ones(len(z)), xy])
-    weight = np.ones(len(z))
-    for _ in range(ROUNDS):
-        residual = z - np.einsum("ij,ij->i", basis, coefficients[label])
-        u = residual / (4.0 * sigma[label])
+    weight = np.empty(0)
+    for some in (*[np.s_[::step]] * ROUNDS, np.s_[:]):
+        of, x, y, value = label[some], xy[some, 0], xy[some, 1], z[some]
+        residual = value - coefficients[of, 0] - coefficients[of, 1] * x - coefficients[of, 2] * y
+        u = residual / (4.0 * sigma[of])
         weight = np.where(np.abs(u) < 1, (1 - u * u) ** 2, 0.0)
-        coefficients = _solve(label, basis, z, weight, coefficients, config)
-        sigma = _scale(label, residual, weight, count)
+        coefficients = _solve(of, (x, y), value, weight, coefficients, config)
+        sigma = _scale(of, residual, weight, count)
     n = np.bincount(label, weight > 0, minlength=count).astype(np.intp)
     enough = n >= config.min_top_points
     lever2 = radius_m**2 / 4
@@ -98,7 +101,7 @@ def _median_per_label(label: NDArray[np.intp], values: FloatArray, default: Floa
 
 def _solve(
     label: NDArray[np.intp],
-    basis: FloatArray,
+    xy_m: tuple[FloatArray, FloatArray],
     values: FloatArray,
     weight: FloatArray,
     before: FloatArray,
@@ -107,11 +110,13 @@ def _solve(
     """Weighted least squares of every label, shape (T, 3); as before where there are too few points."""
     count = len(before)
     normal, right = np.empty((count, 3, 3)), np.empty((count, 3))
-    for i in range(3):
-        scaled = weight * basis[:, i]
+    basis = (None, *xy_m)
+    for i, column in enumerate(basis):
+        scaled = weight if column is None else weight * column
         right[:, i] = np.bincount(label, scaled * values, minlength=count)
-        for j in range(i, 3):
-            normal[:, i, j] = normal[:, j, i] = np.bincount(label, scaled * basis[:, j], minlength=count)
+        for j, other in enumerate(basis[i:], i):
+            entry = np.bincount(label, scaled if other is None else scaled * other, minlength=count)
+            normal[:, i, j] = normal[:, j, i] = entry
     usable = (normal[:, 0, 0] >= config.min_top_points / 4) & (np.linalg.det(normal) > 0)
     normal[~usable] = np.eye(3)
     solved = np.linalg.solve(normal, right[..., None])[..., 0]

@@ -6,7 +6,7 @@ holds (a round bottom's centre, or the tip) stands, (u, v), and the slope of the
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -18,7 +18,9 @@ from tubepose.config import ProfileConfig
 from tubepose.labware import RackModel, SlotModel, TubeModel
 from tubepose.transforms import FloatArray
 
-SAMPLES = 512
+SAMPLES = 256
+FEW_SAMPLES = 64
+"""Enough for a place at which walls are looked at."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -58,6 +60,12 @@ def pivot_m(tube: TubeModel) -> float:
     return tube.body.bottom_height_mm * 1e-3 if tube.body.bottom == "round" else 0.0
 
 
+def per_model(models: Sequence[TubeModel], value: Callable[[TubeModel], object]) -> FloatArray:
+    """A value of every tube's model, computed once per model, as an array."""
+    known = {id(model): value(model) for model in models}
+    return np.array([known[id(model)] for model in models], dtype=float)
+
+
 def no_evidence(count: int) -> Evidence:
     """Nothing measured."""
     return Evidence(np.zeros((count, 4, 4)), np.zeros((count, 4)))
@@ -71,7 +79,7 @@ def evidence(design: FloatArray, value: FloatArray, covariance: FloatArray) -> E
         value: Array of shape (T, K).
         covariance: Array of shape (T, K, K).
     """
-    known = np.isfinite(value).all(axis=1)
+    known = np.asarray(np.isfinite(value).all(axis=1))
     filled = np.where(known[:, None, None], covariance, np.eye(value.shape[1]))
     weighted = np.linalg.solve(filled, design) * known[:, None, None]
     vector = np.einsum("tki,tk->ti", weighted, np.nan_to_num(value))
@@ -79,7 +87,12 @@ def evidence(design: FloatArray, value: FloatArray, covariance: FloatArray) -> E
 
 
 def combine(
-    measured: Evidence, slots: Sequence[SlotModel], tubes: Sequence[TubeModel], rack: RackModel, config: ProfileConfig
+    measured: Evidence,
+    slots: Sequence[SlotModel],
+    tubes: Sequence[TubeModel],
+    rack: RackModel,
+    config: ProfileConfig,
+    samples: int = SAMPLES,
 ) -> Posterior:
     """Posterior mean and covariance under the slot's prior.
 
@@ -96,23 +109,23 @@ def combine(
     covariance = np.linalg.inv(measured.matrix + prior)
     mean = np.einsum("tij,tj->ti", covariance, measured.vector)
     root = np.linalg.cholesky(covariance)
-    x = mean[:, None, :] + np.einsum("tij,mj->tmi", root, _normal_samples())
+    x = mean[:, None, :] + _normal_samples(samples) @ np.swapaxes(root, 1, 2)
     log_prior = _log_allowed(x, play, slots, tubes, rack, config)
     log_weight = log_prior + 0.5 * ((x / spread[:, None, :]) ** 2).sum(axis=2)
     top = log_weight.max(axis=1, keepdims=True)
     weight = np.exp(log_weight - top)
     weight /= weight.sum(axis=1, keepdims=True)
-    posterior = np.einsum("tm,tmi->ti", weight, x)
+    posterior = (weight[:, None, :] @ x)[:, 0]
     off = x - posterior[:, None, :]
-    spread_out = np.einsum("tm,tmi,tmj->tij", weight, off, off)
+    spread_out = np.swapaxes(off * weight[..., None], 1, 2) @ off
     # Where hardly a sample is left its scatter says nothing: at least a tenth of what the measurements leave.
     return Posterior(posterior, spread_out + 0.01 * covariance, np.exp(log_prior).mean(axis=1))
 
 
-@lru_cache(maxsize=1)
-def _normal_samples() -> FloatArray:
-    """Quasi-random standard normal samples, shape (SAMPLES, 4), always the same, with mean 0."""
-    uniform = qmc.Sobol(4, scramble=True, rng=np.random.default_rng(0)).random(SAMPLES // 2)
+@lru_cache(maxsize=4)
+def _normal_samples(count: int) -> FloatArray:
+    """Quasi-random standard normal samples, shape (count, 4), always the same, with mean 0."""
+    uniform = qmc.Sobol(4, scramble=True, rng=np.random.default_rng(0)).random(count // 2)
     half = norm.ppf(np.clip(uniform, 1e-6, 1 - 1e-6))
     return np.asarray(np.concatenate([half, -half]))
 
@@ -135,10 +148,10 @@ def _log_allowed(
     groups: dict[tuple[object, ...], list[int]] = {}
     for i, slot in enumerate(slots):
         groups.setdefault((slot.shape, slot.size_mm, slot.corner_radius_mm), []).append(i)
-    held = np.array([pivot_m(tube) for tube in tubes])
-    top = np.array([min(rack.depth_m, tube.height_m) for tube in tubes])
-    radius = np.array(
-        [[float(t.body_radius_m(h)), float(t.body_radius_m(z))] for t, h, z in zip(tubes, held, top, strict=True)]
+    held = per_model(tubes, pivot_m)
+    top = per_model(tubes, lambda tube: min(rack.depth_m, tube.height_m))
+    radius = per_model(
+        tubes, lambda tube: tube.body_radius_m(np.array([pivot_m(tube), min(rack.depth_m, tube.height_m)]))
     )
     for members in groups.values():
         slot = slots[members[0]]

@@ -21,12 +21,10 @@ class Standing:
 
     Attributes:
         points_m: Array of shape (N, 3), rack frame, metres.
-        rows: Row of each point in `RgbdFrame.points_m`, shape (N,).
         camera_m: Place of the camera, rack frame, shape (3,), metres: every point was seen along a line from there.
     """
 
     points_m: FloatArray
-    rows: NDArray[np.intp]
     camera_m: FloatArray
 
     def on_level(self, height_m: float | FloatArray, points_m: FloatArray | None = None) -> FloatArray:
@@ -45,7 +43,7 @@ class Standing:
 
     def take(self, keep: NDArray[np.bool_] | NDArray[np.intp]) -> Standing:
         """The same of some of the points."""
-        return Standing(self.points_m[keep], self.rows[keep], self.camera_m)
+        return Standing(self.points_m[keep], self.camera_m)
 
 
 def gather_standing(
@@ -84,6 +82,5 @@ def gather_standing(
     with np.errstate(invalid="ignore"):
         kept = np.flatnonzero((z > lowest_m) & (z < highest_m))
     points = transform_points(T_rack_camera, part[kept])
-    near = np.all(np.abs(points[:, :2]) < half, axis=1)
-    v, u = np.divmod(kept[near], max(right - left, 1))
-    return Standing(points[near], (v + top) * width + u + left, T_rack_camera[:3, 3])
+    near = (np.abs(points[:, 0]) < half[0]) & (np.abs(points[:, 1]) < half[1])
+    return Standing(points[near], T_rack_camera[:3, 3])

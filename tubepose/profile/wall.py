@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from tubepose.config import ProfileConfig
 from tubepose.labware import RackModel, TubeModel
-from tubepose.profile.posterior import Evidence, no_evidence, pivot_m
+from tubepose.profile.posterior import Evidence, no_evidence, per_model, pivot_m
 from tubepose.profile.standing import Standing
 from tubepose.transforms import FloatArray
 
@@ -87,10 +87,10 @@ def _wall_points(
     config: ProfileConfig,
 ) -> tuple[FloatArray, FloatArray, FloatArray, NDArray[np.intp]]:
     """Residual, direction from the axis (N, 2), height above the held point, and tube of the points near a wall."""
-    held = np.array([pivot_m(tube) for tube in tubes])
-    skirt = np.array([t.height_m - (t.cap.height_mm * 1e-3 if t.cap is not None else 0.0) for t in tubes]) - SKIRT_GAP_M
-    body = np.array([[t.body.bottom_diameter_mm, t.body.top_diameter_mm] for t in tubes]) * 0.5e-3
-    ends = np.array([[t.body.bottom_height_mm, t.body.height_mm] for t in tubes]) * 1e-3
+    held = per_model(tubes, pivot_m)
+    skirt = per_model(tubes, _skirt_m) - SKIRT_GAP_M
+    body = per_model(tubes, lambda tube: [tube.body.bottom_diameter_mm, tube.body.top_diameter_mm]) * 0.5e-3
+    ends = per_model(tubes, lambda tube: [tube.body.bottom_height_mm, tube.body.height_mm]) * 1e-3
     rows = np.flatnonzero(label >= 0)
     of = label[rows]
     low = standing.points_m[rows, 2] - rack.floor_m < skirt[of]
@@ -107,3 +107,8 @@ def _wall_points(
     kept = (np.abs(residual) < 2 * PEAK * config.wall_noise_m) & (np.einsum("ij,ij->i", off, towards) > 0)
     normal = off[kept] / rho[kept][:, None]
     return residual[kept], normal, above[kept], of[kept]
+
+
+def _skirt_m(tube: TubeModel) -> float:
+    """Height of the lower edge of a tube's cap or flange, or of its rim, metres."""
+    return tube.height_m - (tube.cap.height_mm * 1e-3 if tube.cap is not None else 0.0)
