@@ -14,7 +14,17 @@ def estimate(
         list[Path], typer.Argument(help="Capture folders, .ply or .mcap files, session folders, or folders of those.")
     ],
     out: Annotated[Path, typer.Option(help="Folder for the results; nothing is written anywhere else.")],
-    rack: Annotated[str | None, typer.Option(help="Rack by name or YAML file; a session knows its own.")] = None,
+    rack: Annotated[
+        str | None,
+        typer.Option(
+            help="Rack by name or YAML file; a session knows its own. auto: the one of the catalogue that fits. "
+            "grid: any rack with --pitch and --slot."
+        ),
+    ] = None,
+    pitch: Annotated[str | None, typer.Option(help="--rack grid: distance of slots, X or XxY in mm.")] = None,
+    slot: Annotated[
+        str | None, typer.Option(help="--rack grid: opening, square:SIDE, square:SIDExSIDE or round:DIAMETER in mm.")
+    ] = None,
     tubes: Annotated[
         str | None,
         typer.Option(help="Kinds of tube that can be there: names or files, with commas; goes before a session's own."),
@@ -53,13 +63,12 @@ def estimate(
     from tubepose.capture.session import SESSION_FILE, is_session
     from tubepose.config import load_config
     from tubepose.errors import CaptureError, TubePoseError
-    from tubepose.labware import load_rack
-    from tubepose_cli.inputs import capture_jobs, make_detector, read_methods, read_tubes, refuse_twins
+    from tubepose_cli.inputs import capture_jobs, make_detector, read_methods, read_rack, read_tubes, refuse_twins
     from tubepose_cli.results import run_estimates
     from tubepose_cli.show import describe_tubes, finish, say
 
     settings = load_config(config)
-    rack_model = load_rack(rack) if rack is not None else None
+    choice = read_rack(rack, pitch, slot)
     tube_models = read_tubes(tubes) if tubes is not None else ()
     methods = read_methods(method)
     detector_for = make_detector(detector, model, boxes, classes, layout, settings)
@@ -69,7 +78,7 @@ def estimate(
     for path in captures:
         try:
             found, unread = capture_jobs(
-                path, rack_model, tube_models, unit=unit, hint=hint, topics=topics, fail_fast=fail_fast
+                path, choice, tube_models, settings, unit=unit, hint=hint, topics=topics, fail_fast=fail_fast, say=say
             )
             kept, twins = refuse_twins(found, jobs)
             if twins and fail_fast:

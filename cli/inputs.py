@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 import difflib
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from tubepose.batch import DetectorFactory, Job
     from tubepose.capture.session import SlotHint
+    from tubepose.capture.source import Capture
     from tubepose.config import Config
     from tubepose.labware import RackModel, TubeModel
+    from tubepose.rack_grid import SlotLattice
 
 SAMPLE = "sample"
 
@@ -34,6 +36,98 @@ def read_tubes(names: str) -> tuple[TubeModel, ...]:
     from tubepose.labware import load_tube
 
     return tuple(load_tube(name.strip()) for name in names.split(",") if name.strip())
+
+
+@dataclass(frozen=True)
+class RackChoice:
+    """What `--rack` says: a rack, or how to find one out for each capture.
+
+    Attributes:
+        rack: The rack, where it is named.
+        lattice: Pitch and opening of ``--rack grid``; None otherwise.
+        auto: True for ``--rack auto``.
+    """
+
+    rack: RackModel | None = None
+    lattice: SlotLattice | None = None
+    auto: bool = False
+
+    @property
+    def open(self) -> bool:
+        """Whether the rack is only known once a capture was looked at."""
+        return self.auto or self.lattice is not None
+
+
+def read_rack(name: str | None, pitch: str | None, slot: str | None) -> RackChoice:
+    """The options ``--rack NAME|FILE|auto|grid``, ``--pitch X[xY]``, ``--slot square:SIDE[xSIDE]|round:DIAMETER``."""
+    from tubepose.errors import ConfigError
+    from tubepose.labware import load_rack
+
+    if name != "grid" and (pitch is not None or slot is not None):
+        raise ConfigError("--pitch and --slot go with --rack grid")
+    if name is None:
+        return RackChoice()
+    if name == "auto":
+        return RackChoice(auto=True)
+    if name == "grid":
+        if pitch is None or slot is None:
+            raise ConfigError("--rack grid needs --pitch and --slot, for example --pitch 18.5x17.7 --slot square:16.5")
+        return RackChoice(lattice=_lattice(pitch, slot))
+    return RackChoice(rack=load_rack(name))
+
+
+def _lattice(pitch: str, slot: str) -> SlotLattice:
+    from tubepose.errors import ConfigError
+    from tubepose.labware import SlotShape
+    from tubepose.rack_grid import SlotLattice
+
+    shape, _, size = slot.partition(":")
+    if shape not in ("square", "round"):
+        raise ConfigError(f"--slot {slot}: expected square:SIDE, square:SIDExSIDE or round:DIAMETER, millimetres")
+    pitch_mm, size_mm = _sides("--pitch", pitch), _sides("--slot", size)
+    if shape == "round" and size_mm[0] != size_mm[1]:
+        raise ConfigError(f"--slot {slot}: a round slot has one diameter")
+    if size_mm[0] >= pitch_mm[0] or size_mm[1] >= pitch_mm[1]:
+        raise ConfigError(f"--pitch {pitch}, --slot {slot}: the openings must be smaller than their pitch")
+    return SlotLattice(pitch_mm, SlotShape(shape="square" if shape == "square" else "round", size_mm=size_mm))
+
+
+def _sides(option: str, text: str) -> tuple[float, float]:
+    from tubepose.errors import ConfigError
+
+    try:
+        sides = [float(side) for side in text.split("x")]
+    except ValueError:
+        sides = []
+    if len(sides) not in (1, 2) or min(sides) <= 0:
+        raise ConfigError(f"{option} {text}: expected millimetres as X or XxY, for example 18.5x17.7")
+    return sides[0], sides[-1]
+
+
+def find_rack(capture: Capture, choice: RackChoice, config: Config) -> tuple[RackModel, str]:
+    """The rack of a capture whose rack is not named, from its first frame; and what to say about it.
+
+    Raises:
+        CaptureError: No rack can be named, or no slots are found; the reason holds the ranking.
+    """
+    from tubepose.errors import CaptureError
+    from tubepose.provenance import pinned_threads
+    from tubepose.rack_grid import register_grid
+    from tubepose.rack_naming import name_rack
+
+    frame = next(iter(capture.frames()), None)
+    if frame is None:
+        raise CaptureError(f"{capture.path}: no frame to find the rack in")
+    points_m = frame.points_m[frame.valid]
+    with pinned_threads(1):
+        if choice.lattice is not None:
+            pose = register_grid(points_m, choice.lattice, config, frame.intrinsics)
+        else:
+            pose, _ = name_rack(points_m, config, intrinsics=frame.intrinsics)
+    if pose.rack is None or pose.T_camera_rack is None:
+        raise CaptureError(f"{capture.path}: {pose.reason}")
+    margin = "" if choice.lattice is not None else f", by a margin of {pose.named_by_margin:.0%}"
+    return pose.rack, f"{capture.name}: rack {pose.rack.name} found{margin}"
 
 
 def read_methods(names: str) -> tuple[str, ...]:
@@ -82,36 +176,66 @@ def find_sessions(paths: Sequence[Path], *, fail_fast: bool = False) -> tuple[li
 
 def capture_jobs(
     path: Path,
-    rack: RackModel | None,
+    choice: RackChoice,
     tubes: tuple[TubeModel, ...],
+    config: Config,
     *,
     unit: str | None = None,
     hint: str | None = None,
     topics: Mapping[str, str | None] | None = None,
     fail_fast: bool = False,
+    say: Callable[[str], None] = lambda _: None,
 ) -> tuple[list[Job], list[str]]:
     """Jobs of one typed path (a session's trials, or the captures found there), and what could not be opened.
 
-    `rack` and `tubes` win over what a session says.
+    `choice` and `tubes` win over what a session says. What is found out about racks is told to `say`.
     """
     from tubepose.batch import Job, session_jobs
     from tubepose.capture.session import SESSION_FILE, is_session, load_session
     from tubepose.capture.source import open_captures
     from tubepose.errors import CaptureError, ConfigError
+    from tubepose.rack_naming import catalogue_racks
 
     if path.name == SESSION_FILE or (path.is_dir() and is_session(path)):
-        jobs, problems = session_jobs(load_session(path), fail_fast=fail_fast)
-        changed = [replace(job, rack=rack or job.rack, tubes=tubes or job.tubes) for job in jobs]
-        return changed, list(problems)
+        known, problems = session_jobs(load_session(path), fail_fast=fail_fast)
+        jobs = [replace(job, rack=choice.rack or job.rack, tubes=tubes or job.tubes) for job in known]
+        found, unfound = find_racks(jobs, choice, config, fail_fast=fail_fast, say=say) if choice.open else (jobs, [])
+        return found, [*problems, *unfound]
     if not path.exists():
         raise CaptureError(f"{path}: no such file or folder")
-    if rack is None:
-        raise ConfigError(
-            f"{path}: not a session, so the rack must be named: --rack NAME|FILE (see 'tubepose labware list')"
-        )
-    told = read_hint(hint, rack) if hint is not None else None
     topic = {f"{kind}_topic": name for kind, name in (topics or {}).items()}
-    return [Job(capture, rack, tubes, told) for capture in open_captures(path, unit=unit, **topic)], []
+    if choice.rack is not None:
+        told = read_hint(hint, choice.rack) if hint is not None else None
+        return [Job(capture, choice.rack, tubes, told) for capture in open_captures(path, unit=unit, **topic)], []
+    if not choice.open:
+        raise ConfigError(
+            f"{path}: not a session, so the rack must be named: --rack NAME|FILE|auto|grid "
+            "(see 'tubepose labware list')"
+        )
+    unknown = catalogue_racks()[0]
+    jobs = [Job(capture, unknown, tubes) for capture in open_captures(path, unit=unit, **topic)]
+    found, problems = find_racks(jobs, choice, config, fail_fast=fail_fast, say=say)
+    return [replace(job, hint=read_hint(hint, job.rack)) for job in found] if hint else found, problems
+
+
+def find_racks(
+    jobs: Iterable[Job], choice: RackChoice, config: Config, *, fail_fast: bool, say: Callable[[str], None]
+) -> tuple[list[Job], list[str]]:
+    """The jobs with the racks that are found in their captures, and one line per capture that has none."""
+    from tubepose.errors import TubePoseError
+
+    found, problems = [], []
+    for job in jobs:
+        try:
+            rack, words = find_rack(job.capture, choice, config)
+        except TubePoseError as problem:
+            if fail_fast:
+                raise
+            problems.append(str(problem))
+            continue
+        say(words)
+        found.append(replace(job, rack=rack))
+    return found, problems
 
 
 def read_hint(text: str, rack: RackModel) -> SlotHint:

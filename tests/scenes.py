@@ -7,7 +7,7 @@ from scipy.spatial.transform import Rotation
 
 from tubepose.capture.frame import CameraIntrinsics, RgbdFrame
 from tubepose.labware import RackModel, TubeModel
-from tubepose.transforms import FloatArray, make_transform, tilt_rotation, transform_points
+from tubepose.transforms import FloatArray, invert_transform, make_transform, tilt_rotation, transform_points
 
 SPACING_M = 0.8e-3
 TUBE_SPACING_M = 0.5e-3
@@ -31,6 +31,15 @@ def slot_floors(rack: RackModel, seed: int = 0, spacing_m: float = 1.5e-3) -> Fl
     xy = rng.uniform(-rack.outline_m / 2, rack.outline_m / 2, (int(np.prod(rack.outline_m) / spacing_m**2), 2))
     inside = np.min([slot.signed_distance_m(xy) for slot in rack.all_slots], axis=0) < 0
     return np.column_stack([xy[inside], np.full(inside.sum(), rack.floor_m)])
+
+
+def seen_past_the_top(points_m: FloatArray, rack: RackModel, T_camera_rack: FloatArray) -> FloatArray:
+    """The points of shape (N, 3), camera frame, whose line of sight does not meet the solid part of a rack's top."""
+    local = transform_points(invert_transform(T_camera_rack), points_m)
+    camera = invert_transform(T_camera_rack)[:3, 3]
+    share = (local[:, 2] - rack.height_m) / (local[:, 2] - camera[2])
+    crossing = local[:, :2] + share[:, None] * (camera[:2] - local[:, :2])
+    return points_m[(local[:, 2] > rack.height_m) | (rack.top_signed_distance_m(crossing) > 0)]
 
 
 def tube_pose(

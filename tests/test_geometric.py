@@ -69,6 +69,7 @@ def test_an_empty_rack_has_no_tube():
 def test_an_empty_rack_with_slot_floors_and_a_table_has_no_tube():
     table = np.random.default_rng(0).uniform([-0.2, -0.2, 0], [0.2, 0.2, 0], (8000, 3))
     more = transform_points(T_CAMERA_RACK, np.vstack([scenes.slot_floors(RACK), table]))
+    more = scenes.seen_past_the_top(more, RACK, T_CAMERA_RACK)
     points, _ = scene([])
     rack, tubes = detect(scenes.unorganised(np.vstack([points, more])))
     assert tubes == ()

@@ -36,15 +36,6 @@ def turned_to_match(T_camera_rack, T_true):
     return min((T_camera_rack, T_camera_rack @ HALF_TURN), key=lambda T: scenes.angle_deg(T[:3, :3], T_true[:3, :3]))
 
 
-def seen_past_the_top(points_m, rack, T_camera_rack):
-    """The points, camera frame, whose line of sight does not meet the solid part of a rack's top."""
-    local = transform_points(invert_transform(T_camera_rack), points_m)
-    camera = invert_transform(T_camera_rack)[:3, 3]
-    share = (local[:, 2] - rack.height_m) / (local[:, 2] - camera[2])
-    crossing = local[:, :2] + share[:, None] * (camera[:2] - local[:, :2])
-    return points_m[(local[:, 2] > rack.height_m) | (rack.top_signed_distance_m(crossing) > 0)]
-
-
 @pytest.mark.parametrize(
     "name", ["chen2023-soft-5x10", "chen2023-hard-5x10", "steel-round-16mm-5x10", "round-10ml-3x4", "quincunx-17mm-8"]
 )
@@ -148,7 +139,7 @@ def test_tubes_slot_floors_and_the_table_do_not_move_the_rack(soft_scan):
         scenes.slot_floors(SOFT),
         table,
     ]
-    seen = seen_past_the_top(transform_points(T_CAMERA_SOFT, np.vstack(others)), SOFT, T_CAMERA_SOFT)
+    seen = scenes.seen_past_the_top(transform_points(T_CAMERA_SOFT, np.vstack(others)), SOFT, T_CAMERA_SOFT)
     crowded = np.vstack([soft_scan, seen])
     pose = register_rack(crowded, SOFT, CONFIG)
     assert pose.status is RackStatus.OK

@@ -1,8 +1,8 @@
 """How well points agree with a rack's pose, and why a pose is not believed (method `edges`).
 
-A wrong rack, or a rack in a wrong place, has points in its openings, lines of sight through its ribs, or explains no more
-than another place would. Points in openings are counted in a thin layer at the height of the top: the ribs lie in it,
-while of a tube's wall that crosses it, or of light in a well, it has little.
+A wrong rack, or one in a wrong place, has points in its openings, lines of sight through its ribs, or explains no
+more than another place would. Points in openings are counted in a thin layer at the height of the top: it
+has all of the ribs, and little of a tube's wall that crosses it or of light in a well.
 """
 
 from __future__ import annotations
@@ -11,11 +11,12 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from tubepose.config import RackConfig
 from tubepose.labware import RackModel
-from tubepose.rack_field import PICTURE_M, picture, top_field
+from tubepose.rack_field import GRID_M, PICTURE_M, picture, top_field
 from tubepose.rack_fit import EDGE_SHIFT_M, LEAST_POINTS, WRONG_SHARE, Fit, Labels, label, to_frame, top_frame
 from tubepose.rack_search import crossings
 from tubepose.transforms import FloatArray
@@ -48,8 +49,8 @@ class Agreement:
     """How well points agree with a pose.
 
     Attributes:
-        rmse_m: RMS distance of the points near the top to its solid part, metres; the part along the normal from the median
-            of all heights within `SCATTER_M`, so that it tells a rough scan from a good one with stray light.
+        rmse_m: RMS distance of the points near the top to its solid part, metres; the part along the normal from the
+            median of all heights within `SCATTER_M`, so that it tells a rough scan from a good one with stray light.
         fitness: Share of the points at its height that are near its solid part.
         in_slot: Share of them that lie in its openings.
         through: Share of what is seen where the solid part should be that lies below it.
@@ -88,8 +89,8 @@ def measure_agreement(points_m: FloatArray, fit: Fit, rack: RackModel, config: R
     if len(solid) < LEAST_POINTS or not np.any(distance < 0):
         return Agreement()
     free_distance, _, free_known = top.look_up(seen.free_m)
-    under = np.count_nonzero(free_distance[free_known] < -THROUGH_MARGIN_M)
-    over = np.count_nonzero(distance < -THROUGH_MARGIN_M)
+    under = int(np.count_nonzero(free_distance[free_known] < -THROUGH_MARGIN_M))
+    over = int(np.count_nonzero(distance < -THROUGH_MARGIN_M))
     near = distance < config.judge_distance_m
     beyond = np.max(np.abs(solid[:, :2]) - rack.outline_m / 2, axis=1)
     stray = distance > config.edge_margin_m
@@ -104,7 +105,7 @@ def measure_agreement(points_m: FloatArray, fit: Fit, rack: RackModel, config: R
         in_slot=float(np.mean(stray[beyond <= 0])) if np.any(beyond <= 0) else 1.0,
         outside=float(np.mean(stray & (beyond > 0) & (beyond < BORDER_M))),
         through=under / max(under + over, 1),
-        rims=float(np.mean(distance[distance < 0] > -RIM_M)) / _rim_share(rack),
+        rims=_near_rims(solid[:, :2], distance, rack) / _rim_share(rack),
         coverage=_coverage(solid, rack),
         unseen=_unseen(points_m, fit, rack),
         evidence=evidence * alike,
@@ -167,8 +168,15 @@ def _mean_chance(rack: RackModel, sign: int) -> float:
 @lru_cache(maxsize=32)
 def _rim_share(rack: RackModel) -> float:
     """Share of the solid part's area that is near an edge."""
-    distance = top_field(rack).table[:, 0]
-    return float(np.mean(distance[distance < 0] > -RIM_M))
+    field = top_field(rack)
+    cells = np.stack(np.unravel_index(np.arange(len(field.table)), field.shape), axis=1)
+    return _near_rims(field.low_m + cells * GRID_M, field.table[:, 0], rack)
+
+
+def _near_rims(xy_m: FloatArray, distance_m: NDArray[np.floating], rack: RackModel) -> float:
+    """Share of the places (N, 2) on the solid part, away from the outline, that are near the edge of an opening."""
+    inner = np.all(np.abs(xy_m) < rack.outline_m / 2 - 2 * RIM_M, axis=1) & (distance_m < 0)
+    return float(np.mean(distance_m[inner] > -RIM_M)) if inner.any() else 0.0
 
 
 @lru_cache(maxsize=32)
@@ -203,7 +211,7 @@ def _spacing(points_m: FloatArray) -> float:
 
 
 def outline_fits(seen: Agreement, config: RackConfig) -> bool:
-    """Whether the top ends where the rack's does, and is there as a whole: something else is a rack that is not found."""
+    """Whether the top ends where the rack's does, and is there as a whole; if not, the rack is not found."""
     return seen.outside <= config.max_outside_share and seen.unseen <= config.max_unseen_share
 
 
@@ -258,8 +266,8 @@ def contradiction(seen: Agreement, fit: Fit, rack: RackModel, config: RackConfig
         ),
         (
             turn_deg > config.max_turn_std_deg or shift_mm > config.max_shift_std_mm,
-            f"its pose is uncertain by {turn_deg:.2f} deg and {shift_mm:.2f} mm (standard deviations), at most "
-            f"{config.max_turn_std_deg:g} deg and {config.max_shift_std_mm:g} mm expected: too little of the top is seen",
+            f"its pose is uncertain by {turn_deg:.2f} deg and {shift_mm:.2f} mm (standard deviations), "
+            f"at most {config.max_turn_std_deg:g} deg, {config.max_shift_std_mm:g} mm expected: too little is seen",
         ),
     )
     return "; ".join(text for failed, text in checks if failed)

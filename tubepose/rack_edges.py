@@ -201,4 +201,3 @@ def _not_found(points_m: FloatArray, rack: RackModel, config: RackConfig, closes
         f"no top of {rack.name} ({outline_words(rack)} mm) among the points; closest: {closest}",
         spacing_m=spacing_m,
     )
-

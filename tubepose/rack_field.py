@@ -101,7 +101,7 @@ def picture(rack: RackModel, cell_m: float = PICTURE_M) -> Float32:
     value = np.where(known, np.where(distance < 0, 1.0, -1.0), 0.0)
     value[value < 0] *= np.sum(value > 0) / np.sum(value < 0)
     value = value.reshape(2 * counts[0] + 1, fine, 2 * counts[1] + 1, fine).mean(axis=(1, 3))
-    return value.astype(np.float32)
+    return np.asarray(value, np.float32)
 
 
 @lru_cache(maxsize=64)
@@ -114,22 +114,18 @@ def picture_spectrum(rack: RackModel, size: int, turned: bool) -> NDArray[np.com
     return np.asarray(np.conj(fft.rfft2(padded)), np.complex64)
 
 
-def turn_signature(spectrum: NDArray[np.complex64], size: int, cell_m: float = PICTURE_M) -> Float32:
+def turn_signature(spectrum: NDArray[np.complexfloating], size: int, cell_m: float = PICTURE_M) -> Float32:
     """How strong a picture's waves are per direction: (TURNS, WAVE_COUNT), each length's mean taken off.
 
     The strength of waves does not change when the picture is moved, and turns with it: so pictures can be turned onto
     each other before it is known where they lie. Directions cover half a turn, because a wave has no sign.
     """
-    places, conjugate = _signature_places(size, cell_m)
-    strength = np.sqrt(np.abs(spectrum.ravel()[places]))
-    del conjugate
-    strength = strength.reshape(TURNS, WAVE_COUNT)
-    strength = strength - strength.mean(axis=0)
-    return np.asarray(strength, np.float32)
+    strength = np.sqrt(np.abs(spectrum.ravel()[_signature_places(size, cell_m)])).reshape(TURNS, WAVE_COUNT)
+    return np.asarray(strength - strength.mean(axis=0), np.float32)
 
 
 @lru_cache(maxsize=16)
-def _signature_places(size: int, cell_m: float) -> tuple[NDArray[np.intp], None]:
+def _signature_places(size: int, cell_m: float) -> NDArray[np.intp]:
     """Where in a flattened half spectrum the waves of every direction and length are."""
     angles = np.arange(TURNS) * np.pi / TURNS
     waves = np.geomspace(1 / WAVES_M[0], 1 / WAVES_M[1], WAVE_COUNT) * cell_m * size
@@ -137,7 +133,7 @@ def _signature_places(size: int, cell_m: float) -> tuple[NDArray[np.intp], None]
     v = np.rint(np.outer(np.sin(angles), waves)).astype(int)
     negative = v < 0
     u, v = np.where(negative, -u, u) % size, np.abs(v)
-    return (u * (size // 2 + 1) + v).ravel(), None
+    return np.asarray((u * (size // 2 + 1) + v).ravel())
 
 
 @lru_cache(maxsize=32)

@@ -20,8 +20,8 @@ from tubepose.rack_field import TopField, top_field
 from tubepose.rack_search import crossings
 from tubepose.transforms import FloatArray, make_transform
 
-# Per round: blur of the edges (the first as wide as a coarse start may be off, the last half a pixel of 0.4 mm), and half
-# widths of the heights that a plane is fitted to, one after the other.
+# Per round: blur of the edges (the first as wide as a coarse start may be off, the last half a pixel of 0.4 mm), and
+# half widths of the heights that a plane is fitted to, one after the other.
 ROUNDS_M = (
     (1.2e-3, np.geomspace(2.5e-3, 0.8e-3, 6)),
     (0.6e-3, np.geomspace(1.5e-3, 0.4e-3, 5)),
@@ -35,7 +35,7 @@ FINE_POINTS = 10_000
 # With so many points so far from the solid part after the rough rounds, finer ones are of no use.
 HOPELESS_SHARE = 0.35
 STRAY_M = 1.2e-3
-# Where heights scatter more than a good sensor's, wider ones count; and edges are looked for at least this near the top.
+# Where heights scatter more than a good sensor's, wider ones count; edges are looked for at least this near the top.
 WIDEST_M = 2.0e-3
 EDGE_WINDOW_M = 1.0e-3
 # A pixel that is half on a rib is still at its height: edges seem that much farther out.
@@ -54,8 +54,8 @@ STRETCH_ROUNDS = 3
 STRETCH_BLUR_M = 0.5e-3
 # How far beside a top points are looked at: a slot and its ribs.
 BESIDE_M = 30e-3
-# Neighbours share their depth's error: squares of this length count as one, if they have this many points. Light that goes
-# astray is alike over a slot and its ribs: what a pose's error is estimated from.
+# Neighbours share their depth's error: squares of this length count as one, if they have this many points. Light that
+# goes astray is alike over a slot and its ribs: what a pose's error is estimated from.
 SHARED_LENGTH_M = 3e-3
 FULL_SQUARE = 12
 CLUSTER_M = 20e-3
@@ -189,7 +189,7 @@ def _balance(points_m: FloatArray) -> FloatArray:
     cells = np.rint(points_m[:, :2] / SHARED_LENGTH_M).astype(np.intp)
     cells -= cells.min(axis=0)
     index = cells[:, 0] * (cells[:, 1].max() + 1) + cells[:, 1]
-    return 1 / np.maximum(np.bincount(index), FULL_SQUARE)[index]
+    return np.asarray(1 / np.maximum(np.bincount(index), FULL_SQUARE)[index])
 
 
 def _clustered(normal: FloatArray, scores: FloatArray, points_m: FloatArray) -> FloatArray:

@@ -50,8 +50,8 @@ def name_rack(
     """Find out which rack stands there, and its pose (always by method ``edges``).
 
     A rack is named if it passes every test of `register_rack`, and its evidence is `rack.min_rival_ratio` times that of
-    the next rack that passes them too. `RackPose.rack` is the rack, `named_by_margin` how much its evidence beats that of
-    the next rack that passes, as a share of its own: 0 is no difference, 1 is that no other rack passes.
+    the next rack that passes them too. `RackPose.rack` is the rack, `named_by_margin` how much its evidence beats that
+    of the next rack that passes, as a share of its own: 0 is no difference, 1 is that no other rack passes.
 
     Args:
         points_m: Array of shape (N, 3), camera frame, metres, without NaN: the rack's box or the whole frame.
@@ -72,7 +72,9 @@ def name_rack(
     ranking = tuple(RankedRack(rack, best.agreement.evidence, best.reason) for rack, best in order)
     if not ranking or ranking[0].reason:
         told = "; ".join(f"{entry.rack.name}: {entry.reason}" for entry in ranking[:TOLD]) or "no level band at all"
-        return RackPose(RackStatus.REFUSED, f"no rack of the {len(racks)} known ones fits; the nearest are {told}"), ranking
+        return RackPose(
+            RackStatus.REFUSED, f"no rack of the {len(racks)} known ones fits; the nearest are {told}"
+        ), ranking
     rack, best = order[0]
     rival = max((entry.evidence for entry in ranking[1:] if not entry.reason), default=0.0)
     if ranking[0].evidence < config.rack.min_rival_ratio * rival:

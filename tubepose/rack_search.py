@@ -31,8 +31,8 @@ SAME_DIRECTION_RAD = 0.05
 SAME_TURN = 4
 # How many angles of a band are tried: a lattice that is nearly square has two.
 TURN_TRIES = 3
-# Poses that are worth a refinement: the best of those tried at a time, if they explain this share of what lies there; any
-# with a larger one, at once.
+# Poses that are worth a refinement: the best of those tried at a time, if they explain this share of what lies there;
+# any with a larger one, at once.
 BEST_PLACED = 2
 LEAST_SHARE = 0.12
 # Pictures of more than 1.6 m are not searched: no capture that shows ribs is as wide.

@@ -14,9 +14,15 @@ from tubepose.config import Config
 from tubepose.detection.model import RACK_CLASS, TUBE_CLASS, Detection
 from tubepose.labware import RackModel, TubeModel
 from tubepose.preprocessing import TALLEST_TUBE_M, find_rack_top
+from tubepose.rack_edges import best_registration, coarse_sample
+from tubepose.rack_fit import top_frame
+from tubepose.rack_pose import MIN_POINTS
+from tubepose.rack_search import levels
 from tubepose.transforms import FloatArray, invert_transform, transform_points
 
 CELL_M = 5e-4
+# What stands on a rack may lean over its outline.
+MARGIN_M = 5e-3
 
 
 @dataclass(frozen=True)
@@ -42,20 +48,32 @@ class GeometricDetector:
         """
         rows = np.flatnonzero(frame.valid)
         points = frame.points_m[rows]
-        top = find_rack_top(points, self.rack, self.config.rack_top) if len(points) >= 50 else None
-        if top is None or not top.fits(self.config.rack_top):
+        T_camera_top = self._find_top(points)
+        if T_camera_top is None:
             return (self._detection(frame, RACK_CLASS, 0.0, rows, rows),)
-        local = transform_points(invert_transform(top.T_camera_top), points)
-        margin = 5e-3
-        near = np.all(np.abs(local[:, :2]) < np.array(top.size_m) / 2 + margin, axis=1)
+        local = transform_points(invert_transform(T_camera_top), points)
+        near = np.all(np.abs(local[:, :2]) < self.rack.outline_m / 2 + MARGIN_M, axis=1)
         on_rack = near & (local[:, 2] > -self.rack.height_m) & (local[:, 2] < TALLEST_TUBE_M)
-        found = [self._detection(frame, RACK_CLASS, 1.0, rows[on_rack], rows[top.band_rows])]
+        band = on_rack & (np.abs(local[:, 2]) < self.config.rack_top.band_m)
+        found = [self._detection(frame, RACK_CLASS, 1.0, rows[on_rack], rows[band])]
         standing = on_rack & (local[:, 2] > self.config.slots.clearance_m)
         labels = self._part(local[standing], self.rack.slot_centers_m)
         for label in range(labels.max(initial=-1) + 1):
             members = rows[standing][labels == label]
             found.append(self._detection(frame, TUBE_CLASS, 1.0, members, members))
         return tuple(found)
+
+    def _find_top(self, points_m: FloatArray) -> FloatArray | None:
+        """T_camera_top, origin at the middle of the rack's top, z up; None where no band fits the rack."""
+        config = self.config.rack_top
+        if len(points_m) < MIN_POINTS:
+            return None
+        if self.config.rack.method == "obb-icp":
+            top = find_rack_top(points_m, self.rack, config)
+            return top.T_camera_top if top is not None and top.fits(config) else None
+        found_levels = levels(coarse_sample(points_m, config), config)
+        best = best_registration(points_m, found_levels, self.rack, self.config)
+        return None if best is None or best.reason else top_frame(best.fit.T_camera_rack, self.rack)
 
     def _part(self, points_m: FloatArray, centers_m: FloatArray) -> NDArray[np.intp]:
         """Label of every standing point (N, 3), frame of the top; shape (N,), -1 for points of no tube.

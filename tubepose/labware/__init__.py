@@ -1,6 +1,6 @@
 """Racks, tubes and printed caps: definitions in YAML, a built-in catalogue, and the geometry that follows from them."""
 
-from tubepose.labware.racks import RackModel, SlotModel
+from tubepose.labware.racks import RackModel, SlotGrid, SlotModel, SlotShape
 from tubepose.labware.reading import Labware, catalogue, load_cap, load_rack, load_tube, read_labware
 from tubepose.labware.tubes import CapModel, TubeModel, WallOptics
 
@@ -8,7 +8,9 @@ __all__ = [
     "CapModel",
     "Labware",
     "RackModel",
+    "SlotGrid",
     "SlotModel",
+    "SlotShape",
     "TubeModel",
     "WallOptics",
     "catalogue",

@@ -126,10 +126,9 @@ class RackModel(Definition):
         outline_mm: Size of the top along x and y.
         height_mm: Height of the top above the base.
         floor_mm: Height of the slot floor above the base, where a tube's bottom stands.
-        floor_tolerance_mm: Standard deviation of the slot floor's height below the top.
+        floor_tolerance_mm: Standard deviation of the slot floor's height below the top; large for a rack that was found by
+            its slots alone.
         floor_play_mm: How far a tube's bottom centre may stand off the slot's centre (a dent in the floor keeps it).
-        floor_tolerance_mm: How well the height of the slot floor below the top is known; a rack that was found by its slots
-            alone has a large one.
         slots: The slots, each with its own centre, shape and size; or
         grid: the shorthand for them. Exactly one of the two.
         source: Where the measures come from.
@@ -143,7 +142,6 @@ class RackModel(Definition):
     height_mm: Positive
     floor_mm: NonNegative
     floor_play_mm: NonNegative = 1.0
-    floor_tolerance_mm: NonNegative = 0.2
     floor_tolerance_mm: NonNegative = 0.1
     grid: SlotGrid | None = None
     slots: tuple[SlotModel, ...] = ()

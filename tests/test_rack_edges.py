@@ -1,0 +1,126 @@
+"""Registration by edges where little of the rack is seen: covers, cuts, neighbours, full racks; and its covariance."""
+
+import numpy as np
+import pytest
+import scenes
+
+from tubepose.config import Config
+from tubepose.labware import load_rack, load_tube
+from tubepose.rack import RackStatus, register_rack
+from tubepose.rack_field import top_field
+from tubepose.transforms import HALF_TURN, invert_transform, transform_points
+
+CONFIG = Config()
+SOFT = load_rack("chen2023-soft-5x10")
+STEEL = load_rack("steel-round-13mm-5x10")
+MIXED = load_rack("mixed-6x15ml-4x50ml")
+CAPPED = load_tube("chen2023-tube-3")
+T_TRUE = scenes.camera_from_rack(SOFT, yaw_rad=0.4, tilt_rad=0.15)
+TOP = scenes.rack_top(SOFT, spacing_m=0.6e-3)
+
+
+def register(points_in_rack, rack=SOFT, T=T_TRUE):
+    return register_rack(transform_points(T, points_in_rack), rack, CONFIG)
+
+
+def error(pose, T=T_TRUE, rack=SOFT):
+    """Rotation (degrees) and shift of the top's centre (mm), but for half a turn."""
+    top = np.array([0.0, 0.0, rack.height_m])
+    T_found = min((pose.T_camera_rack, pose.T_camera_rack @ HALF_TURN), key=lambda F: -F[:3, 0] @ T[:3, 0])
+    return scenes.angle_deg(T_found[:3, :3], T[:3, :3]), 1e3 * float(
+        np.linalg.norm(transform_points(T_found, top) - transform_points(T, top))
+    )
+
+
+def capped(slots):
+    view = scenes.towards_camera(T_TRUE)
+    return [scenes.tube_surface(CAPPED, scenes.tube_pose(SOFT, s.name), SOFT.height_m, seen_from=view) for s in slots]
+
+
+def hidden_by(top, slots, reach_m):
+    """The top less what is under caps in those slots."""
+    for slot in slots:
+        top = top[np.hypot(*(top[:, :2] - slot.center_m).T) > reach_m]
+    return top
+
+
+@pytest.mark.parametrize("rack", [SOFT, MIXED], ids=lambda rack: rack.name)
+def test_the_field_is_the_racks_signed_distance(rack):
+    rng = np.random.default_rng(0)
+    xy = rng.uniform(-0.5, 0.5, (4000, 2)) * (rack.outline_m + 5e-3)
+    found, _, known = top_field(rack).look_up(xy)
+    true = rack.top_signed_distance_m(xy)
+    near = known & (np.abs(true) < 0.3e-3)
+    assert known.all()
+    assert np.abs(found - true)[near].max() < 1e-4
+    assert np.abs(found - true)[near].mean() < 1e-5
+
+
+def test_which_tops_are_the_same_after_half_a_turn():
+    assert top_field(SOFT).symmetric
+    assert top_field(STEEL).symmetric
+    assert not top_field(MIXED).symmetric
+
+
+def test_a_rack_full_of_capped_tubes_is_registered_by_slivers_of_its_ribs():
+    top = hidden_by(TOP, SOFT.all_slots, 9.5e-3)
+    assert len(top) < 0.75 * len(TOP)
+    pose = register(np.vstack([top, *capped(SOFT.all_slots)]))
+    assert pose.status is RackStatus.OK, pose.reason
+    turn_deg, shift_mm = error(pose)
+    assert turn_deg < 0.1
+    assert shift_mm < 0.1
+
+
+def test_a_rack_cut_by_the_image_edge_is_registered_by_what_is_left():
+    pose = register(TOP[TOP[:, 0] < 0.045])
+    assert pose.status is RackStatus.OK, pose.reason
+    assert error(pose)[1] < 0.15
+
+
+def test_a_plate_above_a_third_of_the_rack_does_not_move_it():
+    plate = np.random.default_rng(0).uniform([0.03, -0.05, 0.15], [0.1, 0.05, 0.15], (20_000, 3))
+    pose = register(np.vstack([TOP[TOP[:, 0] < 0.03], plate]))
+    assert pose.status is RackStatus.OK, pose.reason
+    assert error(pose)[1] < 0.15
+
+
+def test_a_second_rack_beside_it_does_not_move_it():
+    beside = TOP + np.array([0.0, SOFT.outline_m[1] + 6e-3, 0.0])
+    pose = register(np.vstack([TOP, beside]))
+    assert pose.status is RackStatus.OK, pose.reason
+    both = [T_TRUE, T_TRUE.copy()]
+    both[1][:3, 3] += T_TRUE[:3, 1] * (SOFT.outline_m[1] + 6e-3)
+    assert min(error(pose, T)[1] for T in both) < 0.1
+
+
+def test_light_that_sinks_half_of_the_points_does_not_sink_the_rack():
+    rng = np.random.default_rng(0)
+    sunk = TOP.copy()
+    stray = rng.uniform(size=len(sunk)) < 0.4
+    sunk[stray, 2] -= rng.exponential(0.8e-3, stray.sum())
+    pose = register(sunk)
+    T_found = pose.T_camera_rack
+    assert abs((invert_transform(T_TRUE) @ T_found)[2, 3]) < 5e-5  # the mean sinks by 0.3 mm
+
+
+def test_nothing_of_the_rack_but_one_row_is_not_believed():
+    pose = register(TOP[TOP[:, 1] > 0.027])
+    assert pose.status is not RackStatus.OK
+    assert pose.covariance is None
+
+
+def test_openings_that_are_wider_than_the_racks_are_another_rack():
+    pose = register(TOP, STEEL)
+    assert pose.status is not RackStatus.OK
+    assert "another rack" in pose.reason
+
+
+def test_the_covariance_holds_what_repeated_scans_do():
+    for seed in range(6):
+        pose = register(scenes.rack_top(SOFT, seed, spacing_m=0.8e-3))
+        assert pose.covariance.shape == (6, 6)
+        assert np.all(np.linalg.eigvalsh(pose.covariance) > 0)
+        turn_deg, shift_mm = error(pose)
+        assert turn_deg < 3 * np.rad2deg(np.sqrt(np.trace(pose.covariance[:3, :3])))
+        assert shift_mm < 3e3 * np.sqrt(np.trace(pose.covariance[3:, 3:]))

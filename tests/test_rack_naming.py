@@ -1,0 +1,110 @@
+"""Racks that are not named: out of the catalogue, or by pitch and opening alone."""
+
+import numpy as np
+import pytest
+import scenes
+
+from tubepose.config import Config
+from tubepose.errors import ConfigError
+from tubepose.labware import SlotShape, load_rack
+from tubepose.rack import RackStatus
+from tubepose.rack_grid import SlotLattice, register_grid
+from tubepose.rack_naming import catalogue_racks, name_rack
+from tubepose.transforms import HALF_TURN, transform_points
+from tubepose_cli.inputs import read_rack
+
+CONFIG = Config()
+NAMES = ["chen2023-soft-5x10", "chen2023-hard-5x10", "round-10ml-3x4", "mixed-6x15ml-4x50ml"]
+SOFT = load_rack("chen2023-soft-5x10")
+
+
+def scan(rack):
+    T = scenes.camera_from_rack(rack, 0.5, 0.15)
+    return transform_points(T, scenes.rack_top(rack, spacing_m=0.7e-3)), T
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_rack_is_named_out_of_the_catalogue(name):
+    rack = load_rack(name)
+    points, T = scan(rack)
+    pose, ranking = name_rack(points, CONFIG)
+    assert pose.status is RackStatus.OK, pose.reason
+    assert pose.rack == ranking[0].rack == rack
+    assert 0.3 < pose.named_by_margin <= 1
+    assert (
+        min(scenes.angle_deg(pose.T_camera_rack[:3, :3], (T @ turn)[:3, :3]) for turn in (np.eye(4), HALF_TURN)) < 0.1
+    )
+
+
+def test_without_the_right_rack_none_is_named_and_the_reason_ranks_them():
+    others = [rack for rack in catalogue_racks() if rack != SOFT]
+    pose, ranking = name_rack(scan(SOFT)[0], CONFIG, others)
+    assert pose.status is RackStatus.REFUSED
+    assert pose.T_camera_rack is None
+    assert pose.rack is None
+    assert pose.reason.startswith(f"no rack of the {len(others)} known ones fits; the nearest are ")
+    assert ranking[0].rack.name in pose.reason
+
+
+def test_two_racks_that_look_the_same_are_not_named():
+    twin = SOFT.model_copy(update={"name": "twin"})
+    pose, _ = name_rack(scan(SOFT)[0], CONFIG, [SOFT, twin])
+    assert pose.status is RackStatus.REFUSED
+    assert "more than one rack fits" in pose.reason
+    assert "twin" in pose.reason
+
+
+def test_too_few_points_name_nothing():
+    pose, ranking = name_rack(np.zeros((3, 3)), CONFIG)
+    assert (pose.status, ranking) == (RackStatus.INSUFFICIENT, ())
+
+
+@pytest.mark.parametrize("name", ["chen2023-soft-5x10", "steel-round-16mm-5x10", "round-10ml-3x4"])
+def test_slots_are_found_by_pitch_and_opening_alone(name):
+    rack = load_rack(name)
+    points, T = scan(rack)
+    slot = rack.grid.slot
+    pose = register_grid(points, SlotLattice(rack.grid.pitch_mm, slot), CONFIG)
+    assert pose.status is RackStatus.OK, pose.reason
+    assert (pose.rack.grid.rows, pose.rack.grid.columns) == (rack.grid.rows, rack.grid.columns)
+    assert pose.rack.floor_tolerance_mm > 10
+    assert pose.ambiguous
+    found = transform_points(
+        pose.T_camera_rack,
+        np.column_stack([pose.rack.slot_centers_m, np.full(len(rack.all_slots), pose.rack.height_m)]),
+    )
+    true = transform_points(T, np.column_stack([rack.slot_centers_m, np.full(len(rack.all_slots), rack.height_m)]))
+    nearest = np.linalg.norm(found[:, None] - true[None], axis=2).min(axis=1)
+    assert nearest.max() < 0.3e-3
+
+
+def test_slots_of_another_pitch_are_not_found():
+    lattice = SlotLattice((22.0, 15.0), SlotShape(shape="square", size_mm=(12.0, 12.0)))
+    pose = register_grid(scan(SOFT)[0], lattice, CONFIG)
+    assert pose.status is not RackStatus.OK
+    assert pose.T_camera_rack is None
+
+
+def test_the_options_say_what_a_rack_is():
+    assert read_rack(None, None, None).rack is None
+    assert read_rack("auto", None, None).auto
+    assert read_rack(SOFT.name, None, None).rack == SOFT
+    lattice = read_rack("grid", "18.5x17.7", "square:16.5").lattice
+    assert lattice.pitch_mm == (18.5, 17.7)
+    assert lattice.slot == SlotShape(shape="square", size_mm=(16.5, 16.5))
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        (("auto", "18", None), "go with --rack grid"),
+        (("grid", "18", None), "needs --pitch and --slot"),
+        (("grid", "wide", "square:16"), "--pitch wide: expected millimetres"),
+        (("grid", "18", "star:16"), "--slot star:16: expected square:SIDE"),
+        (("grid", "18x19", "round:13x14"), "a round slot has one diameter"),
+        (("grid", "18", "square:19"), "the openings must be smaller than their pitch"),
+    ],
+)
+def test_wrong_options_are_told_in_one_line(options, words):
+    with pytest.raises(ConfigError, match=words):
+        read_rack(*options)
