@@ -187,7 +187,7 @@ def _pose(
     sectors, allowed = float(measured.circles.sectors[i]), float(posterior.allowed[i])
     reason = rejection(
         sectors=sectors, allowed=allowed, high_m=high, tilt_std_rad=tilt_std, tube=tube, rack=rack, slot=slot.name,
-        config=config,
+        config=config, looked_at=not tube.is_open or bool(np.isfinite(measured.circles.widening_m[i])),
     )  # fmt: skip
     return TubePose(
         TubeStatus.REJECTED if reason else TubeStatus.OK,

@@ -18,7 +18,7 @@ from tubepose.profile.standing import Standing, gather_standing
 from tubepose.profile.tops import Tops, find_tops, mouth_radius_m, top_level_m, top_radius_m
 from tubepose.transforms import FloatArray
 
-TALLER_M = 0.02
+TALLER_M = 0.08
 """Something that stands on something else is looked for this far above the tallest tube."""
 ON_PLANE_M = 5.0e-4
 DISC_GAP_M = 0.9e-3
@@ -84,9 +84,15 @@ def measure_tops(
     tops = find_tops(standing, rack, tubes, config.profile, allowed)
     shape = _shapes(tops, tubes, rack)
     rims = _measure_rims(frame, intrinsics, T_camera_rack, tops, shape, config.profile)
-    # A rim of clear plastic has few points, and other things look like one in the image: both together must speak for it.
+    # A rim of clear plastic has few points, and other things look like one in the image: both must speak for it. Where
+    # it cannot be looked at in an image, its points alone must, as those of a closed top.
     measured = np.isfinite(rims.widening_m)
-    kept = ~shape.open | ~measured | (rims.sectors * tops.support >= config.profile.min_rim_evidence)
+    proven = np.where(
+        measured,
+        rims.sectors * tops.support >= config.profile.min_rim_evidence,
+        tops.support > config.profile.min_support,
+    )
+    kept = ~shape.open | proven
     tops, shape, rims = tops.take(kept), shape.take(kept), rims.take(kept)
     label = label_points(standing, tops.center_m, shape.radius_m)
     planes, discs = _measure_closed(standing, label, tops, shape, config.profile)

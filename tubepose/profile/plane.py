@@ -21,7 +21,7 @@ class TopPlanes:
         height_m: Height of the plane above the rack's base at the given centre, shape (T,), metres; NaN without one.
         slope: Its rise along x and y, shape (T, 2).
         slope_var: Variance of each slope, shape (T,).
-        rms_m: RMS distance of the points that count, shape (T,), metres.
+        rms_m: RMS distance of the points that count, shape (T,), metres; NaN without a plane.
         n_points: Points that count, shape (T,).
     """
 
@@ -85,7 +85,7 @@ def fit_top_planes(
         np.where(enough, coefficients[:, 0], np.nan),
         np.where(enough[:, None], coefficients[:, 1:], np.nan),
         slope_var,
-        sigma,
+        np.where(enough, sigma, np.nan),
         n,
     )
 

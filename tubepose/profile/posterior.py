@@ -140,8 +140,8 @@ def _log_allowed(
 ) -> FloatArray:
     """Log of how far each sample (T, M, 4) is allowed: 0 inside, falling at the edges; shape (T, M).
 
-    A straight body with a straight taper in a convex slot is inside if it is at both ends of what is inside: at the held
-    point and at the rack's top.
+    A straight body with a straight taper in a convex slot is inside if it is at both ends of what is inside: at the
+    held point and at the rack's top.
     """
     soft = config.slot_tolerance_m / 1.7
     total = log_expit((play_m[:, None] - np.hypot(x[..., 0], x[..., 1])) / soft)

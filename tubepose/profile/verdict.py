@@ -18,6 +18,7 @@ def rejection(
     rack: RackModel,
     slot: str,
     config: ProfileConfig,
+    looked_at: bool = True,
 ) -> str:
     """Why a pose cannot be believed; empty if it can.
 
@@ -30,7 +31,10 @@ def rejection(
         rack: The rack.
         slot: Name of the slot.
         config: Limits.
+        looked_at: Whether there were pixels to look at an open rim in.
     """
+    if not looked_at:
+        return "an open rim is measured in the image, and this cloud has no pixels"
     if sectors < config.min_sectors:
         return f"{sectors:.0%} of the top's circle seen, at least {config.min_sectors:.0%} expected"
     if abs(high_m) > config.max_height_error_m:
