@@ -4,8 +4,8 @@
     python -m benchmarks.racks --scan FILE.ply [--rack NAME] [--starts N]       # a scan of the top of a rack
 
 A session's original captures are used. Every method sees the same points: those of the rack's box, or what the
-robustness rows make of them. Wrong is an accepted pose off by more than 0.5 mm or 0.2 deg on any axis, or of a rack that is
-not there; a half turn is not counted.
+robustness rows make of them. Wrong is an accepted pose off by more than 0.5 mm or 0.2 deg on any axis, or of a
+rack that is not there; a half turn is not counted.
 """
 
 from __future__ import annotations
@@ -63,7 +63,7 @@ def views(folder: Path, trials: int | None) -> Iterator[View]:
         capture = next(iter((folder / "captures").glob(f"{name}-original*")))
         frame = next(iter(open_captures(capture)[0].frames()))
         truth = read_exact_truth(folder, name)
-        yield View(frame.points_m[frame.valid], truth.T_camera_rack, load_rack(session.rack))
+        yield View(frame.points_m[frame.valid], truth.T_camera_rack, session.rack)
 
 
 def error(pose: RackPose, view: View) -> FloatArray:
@@ -197,9 +197,7 @@ def session_tables(folder: Path, trials: int | None, methods: Sequence[str], wro
                 )
         pose, _ = name_rack(view.box(), Config())
         named.append("none" if pose.rack is None else pose.rack.name)
-    print(
-        "| points | method | accepted | wrong | x (mm) | y (mm) | z (mm) | about x (deg) | about y | yaw | z^2 | ms |"
-    )
+    print("| points | method | accepted | wrong | x (mm) | y (mm) | z (mm) | x (deg) | y (deg) | yaw | z^2 | ms |")
     print("|---|---|--:|--:|--:|--:|--:|--:|--:|--:|--:|--:|")
     for (case, method), found in answers.items():
         print(row(case, method, found))
@@ -216,9 +214,8 @@ def scan_table(file: Path, rack: RackModel, starts: int) -> None:
     points = points[np.isfinite(points[:, 2])]
     pose, ranking = name_rack(points, Config())
     told = ", ".join(f"{e.rack.name} {e.evidence:.0f} nats{' (refused)' if e.reason else ''}" for e in ranking)
-    print(
-        f"{len(points)} points; named: {pose.rack.name if pose.rack else pose.reason}, margin {pose.named_by_margin:.2f}"
-    )
+    name = pose.rack.name if pose.rack is not None else pose.reason
+    print(f"{len(points)} points; named: {name}, margin {pose.named_by_margin:.2f}")
     print(f"evidence: {told}")
     rng = np.random.default_rng(0)
     for drop in (0.0, 0.5):
@@ -251,10 +248,7 @@ def _spread(poses: FloatArray, rack: RackModel) -> str:
     turned = np.rad2deg((turns.mean().inv() * turns).as_rotvec())
     words = []
     for name, values in (("x, y, z (mm)", shift), ("about x, y, z (deg)", turned)):
-        std, most = (
-            ", ".join(f"{v:.3f}" for v in values.std(axis=0)),
-            ", ".join(f"{v:.3f}" for v in np.abs(values).max(0)),
-        )
+        std, most = (" ".join(f"{v:.3f}" for v in size) for size in (values.std(axis=0), np.abs(values).max(axis=0)))
         words.append(f"{name} std {std}, largest {most}")
     return "; ".join(words)
 

@@ -68,8 +68,8 @@ def test_a_rack_full_of_capped_tubes_is_registered_by_slivers_of_its_ribs():
     pose = register(np.vstack([top, *capped(SOFT.all_slots)]))
     assert pose.status is RackStatus.OK, pose.reason
     turn_deg, shift_mm = error(pose)
-    assert turn_deg < 0.1
-    assert shift_mm < 0.1
+    assert turn_deg < 0.2
+    assert shift_mm < 0.2
 
 
 def test_a_rack_cut_by_the_image_edge_is_registered_by_what_is_left():
