@@ -63,7 +63,8 @@ def estimate(
     from tubepose.capture.session import SESSION_FILE, is_session
     from tubepose.config import load_config
     from tubepose.errors import CaptureError, TubePoseError
-    from tubepose_cli.inputs import capture_jobs, make_detector, read_methods, read_rack, read_tubes, refuse_twins
+    from tubepose_cli.inputs import capture_jobs, make_detector, read_methods, read_tubes, refuse_twins
+    from tubepose_cli.racks import read_rack
     from tubepose_cli.results import run_estimates
     from tubepose_cli.show import describe_tubes, finish, say
 

@@ -4,17 +4,16 @@ from __future__ import annotations
 
 import difflib
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from tubepose.batch import DetectorFactory, Job
     from tubepose.capture.session import SlotHint
-    from tubepose.capture.source import Capture
     from tubepose.config import Config
     from tubepose.labware import RackModel, TubeModel
-    from tubepose.rack_grid import SlotLattice
+    from tubepose_cli.racks import RackChoice
 
 SAMPLE = "sample"
 
@@ -36,98 +35,6 @@ def read_tubes(names: str) -> tuple[TubeModel, ...]:
     from tubepose.labware import load_tube
 
     return tuple(load_tube(name.strip()) for name in names.split(",") if name.strip())
-
-
-@dataclass(frozen=True)
-class RackChoice:
-    """What `--rack` says: a rack, or how to find one out for each capture.
-
-    Attributes:
-        rack: The rack, where it is named.
-        lattice: Pitch and opening of ``--rack grid``; None otherwise.
-        auto: True for ``--rack auto``.
-    """
-
-    rack: RackModel | None = None
-    lattice: SlotLattice | None = None
-    auto: bool = False
-
-    @property
-    def open(self) -> bool:
-        """Whether the rack is only known once a capture was looked at."""
-        return self.auto or self.lattice is not None
-
-
-def read_rack(name: str | None, pitch: str | None, slot: str | None) -> RackChoice:
-    """The options ``--rack NAME|FILE|auto|grid``, ``--pitch X[xY]``, ``--slot square:SIDE[xSIDE]|round:DIAMETER``."""
-    from tubepose.errors import ConfigError
-    from tubepose.labware import load_rack
-
-    if name != "grid" and (pitch is not None or slot is not None):
-        raise ConfigError("--pitch and --slot go with --rack grid")
-    if name is None:
-        return RackChoice()
-    if name == "auto":
-        return RackChoice(auto=True)
-    if name == "grid":
-        if pitch is None or slot is None:
-            raise ConfigError("--rack grid needs --pitch and --slot, for example --pitch 18.5x17.7 --slot square:16.5")
-        return RackChoice(lattice=_lattice(pitch, slot))
-    return RackChoice(rack=load_rack(name))
-
-
-def _lattice(pitch: str, slot: str) -> SlotLattice:
-    from tubepose.errors import ConfigError
-    from tubepose.labware import SlotShape
-    from tubepose.rack_grid import SlotLattice
-
-    shape, _, size = slot.partition(":")
-    if shape not in ("square", "round"):
-        raise ConfigError(f"--slot {slot}: expected square:SIDE, square:SIDExSIDE or round:DIAMETER, millimetres")
-    pitch_mm, size_mm = _sides("--pitch", pitch), _sides("--slot", size)
-    if shape == "round" and size_mm[0] != size_mm[1]:
-        raise ConfigError(f"--slot {slot}: a round slot has one diameter")
-    if size_mm[0] >= pitch_mm[0] or size_mm[1] >= pitch_mm[1]:
-        raise ConfigError(f"--pitch {pitch}, --slot {slot}: the openings must be smaller than their pitch")
-    return SlotLattice(pitch_mm, SlotShape(shape="square" if shape == "square" else "round", size_mm=size_mm))
-
-
-def _sides(option: str, text: str) -> tuple[float, float]:
-    from tubepose.errors import ConfigError
-
-    try:
-        sides = [float(side) for side in text.split("x")]
-    except ValueError:
-        sides = []
-    if len(sides) not in (1, 2) or min(sides) <= 0:
-        raise ConfigError(f"{option} {text}: expected millimetres as X or XxY, for example 18.5x17.7")
-    return sides[0], sides[-1]
-
-
-def find_rack(capture: Capture, choice: RackChoice, config: Config) -> tuple[RackModel, str]:
-    """The rack of a capture whose rack is not named, from its first frame; and what to say about it.
-
-    Raises:
-        CaptureError: No rack can be named, or no slots are found; the reason holds the ranking.
-    """
-    from tubepose.errors import CaptureError
-    from tubepose.provenance import pinned_threads
-    from tubepose.rack_grid import register_grid
-    from tubepose.rack_naming import name_rack
-
-    frame = next(iter(capture.frames()), None)
-    if frame is None:
-        raise CaptureError(f"{capture.path}: no frame to find the rack in")
-    points_m = frame.points_m[frame.valid]
-    with pinned_threads(1):
-        if choice.lattice is not None:
-            pose = register_grid(points_m, choice.lattice, config, frame.intrinsics)
-        else:
-            pose, _ = name_rack(points_m, config, intrinsics=frame.intrinsics)
-    if pose.rack is None or pose.T_camera_rack is None:
-        raise CaptureError(f"{capture.path}: {pose.reason}")
-    margin = "" if choice.lattice is not None else f", by a margin of {pose.named_by_margin:.0%}"
-    return pose.rack, f"{capture.name}: rack {pose.rack.name} found{margin}"
 
 
 def read_methods(names: str) -> tuple[str, ...]:
@@ -194,7 +101,8 @@ def capture_jobs(
     from tubepose.capture.session import SESSION_FILE, is_session, load_session
     from tubepose.capture.source import open_captures
     from tubepose.errors import CaptureError, ConfigError
-    from tubepose.rack_naming import catalogue_racks
+    from tubepose.labware import load_rack
+    from tubepose_cli.racks import UNKNOWN, find_racks
 
     if path.name == SESSION_FILE or (path.is_dir() and is_session(path)):
         known, problems = session_jobs(load_session(path), fail_fast=fail_fast)
@@ -212,30 +120,9 @@ def capture_jobs(
             f"{path}: not a session, so the rack must be named: --rack NAME|FILE|auto|grid "
             "(see 'tubepose labware list')"
         )
-    unknown = catalogue_racks()[0]
-    jobs = [Job(capture, unknown, tubes) for capture in open_captures(path, unit=unit, **topic)]
+    jobs = [Job(capture, load_rack(UNKNOWN), tubes) for capture in open_captures(path, unit=unit, **topic)]
     found, problems = find_racks(jobs, choice, config, fail_fast=fail_fast, say=say)
     return [replace(job, hint=read_hint(hint, job.rack)) for job in found] if hint else found, problems
-
-
-def find_racks(
-    jobs: Iterable[Job], choice: RackChoice, config: Config, *, fail_fast: bool, say: Callable[[str], None]
-) -> tuple[list[Job], list[str]]:
-    """The jobs with the racks that are found in their captures, and one line per capture that has none."""
-    from tubepose.errors import TubePoseError
-
-    found, problems = [], []
-    for job in jobs:
-        try:
-            rack, words = find_rack(job.capture, choice, config)
-        except TubePoseError as problem:
-            if fail_fast:
-                raise
-            problems.append(str(problem))
-            continue
-        say(words)
-        found.append(replace(job, rack=rack))
-    return found, problems
 
 
 def read_hint(text: str, rack: RackModel) -> SlotHint:

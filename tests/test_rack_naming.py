@@ -11,7 +11,7 @@ from tubepose.rack import RackStatus
 from tubepose.rack_grid import SlotLattice, register_grid
 from tubepose.rack_naming import catalogue_racks, name_rack
 from tubepose.transforms import HALF_TURN, transform_points
-from tubepose_cli.inputs import read_rack
+from tubepose_cli.racks import read_rack
 
 CONFIG = Config()
 NAMES = ["chen2023-soft-5x10", "chen2023-hard-5x10", "round-10ml-3x4", "mixed-6x15ml-4x50ml"]

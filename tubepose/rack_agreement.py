@@ -217,10 +217,15 @@ def outline_fits(seen: Agreement, config: RackConfig) -> bool:
 
 def contradiction(seen: Agreement, fit: Fit, rack: RackModel, config: RackConfig) -> str:
     """Why a fit is not the rack, in words; empty if it is."""
+    checks = (*_misfits(seen, fit, rack, config), *_too_little(seen, fit, config))
+    return "; ".join(text for failed, text in checks if failed)
+
+
+def _misfits(seen: Agreement, fit: Fit, rack: RackModel, config: RackConfig) -> tuple[tuple[bool, str], ...]:
+    """What speaks for another rack, and whether it is so."""
     stretch = np.abs(fit.stretch) - 3 * fit.stretch_std
     most = config.max_stretch if seen.coverage >= config.clear_seen else 2 * config.max_stretch
-    turn_deg, shift_mm = (scale * np.sqrt(np.diag(fit.covariance)[k].max()) for scale, k in _UNITS)
-    checks = (
+    return (
         (
             seen.rmse_m > config.max_inlier_rmse_m,
             f"inlier rmse {seen.rmse_m * 1e3:.2f} mm, at most {config.max_inlier_rmse_m * 1e3:.2f} mm expected",
@@ -250,6 +255,13 @@ def contradiction(seen: Agreement, fit: Fit, rack: RackModel, config: RackConfig
             f"{seen.through:.1%} of what is seen in place of the top's solid part lies below it, "
             f"at most {config.max_through_share:.0%} expected",
         ),
+    )
+
+
+def _too_little(seen: Agreement, fit: Fit, config: RackConfig) -> tuple[tuple[bool, str], ...]:
+    """What is missing to say that it is the rack, and whether it is so."""
+    turn_deg, shift_mm = (float(scale * np.sqrt(np.diag(fit.covariance)[k].max())) for scale, k in _UNITS)
+    return (
         (
             seen.coverage < config.min_seen,
             f"{seen.coverage:.1%} of the top seen, at least {config.min_seen:.0%} expected",
@@ -270,4 +282,3 @@ def contradiction(seen: Agreement, fit: Fit, rack: RackModel, config: RackConfig
             f"at most {config.max_turn_std_deg:g} deg, {config.max_shift_std_mm:g} mm expected: too little is seen",
         ),
     )
-    return "; ".join(text for failed, text in checks if failed)

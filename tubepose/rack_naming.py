@@ -67,24 +67,32 @@ def name_rack(
     if len(points_m) < MIN_POINTS:
         reason = f"{len(points_m)} valid points on the rack, expected at least {MIN_POINTS}"
         return RackPose(RackStatus.INSUFFICIENT, reason), ()
-    found = _registrations(points_m, racks, config)
-    order = sorted(found, key=lambda pair: _rank(pair[1]))
+    order = sorted(_registrations(points_m, racks, config), key=lambda pair: _rank(pair[1]))
     ranking = tuple(RankedRack(rack, best.agreement.evidence, best.reason) for rack, best in order)
-    if not ranking or ranking[0].reason:
-        told = "; ".join(f"{entry.rack.name}: {entry.reason}" for entry in ranking[:TOLD]) or "no level band at all"
-        return RackPose(
-            RackStatus.REFUSED, f"no rack of the {len(racks)} known ones fits; the nearest are {told}"
-        ), ranking
-    rack, best = order[0]
-    rival = max((entry.evidence for entry in ranking[1:] if not entry.reason), default=0.0)
-    if ranking[0].evidence < config.rack.min_rival_ratio * rival:
-        told = ", ".join(f"{entry.rack.name} ({entry.evidence:.0f} nats)" for entry in ranking[:TOLD])
-        reason = f"more than one rack fits: {told}; a ratio of {config.rack.min_rival_ratio:g} expected: name it"
+    reason = _not_named(ranking, len(racks), config)
+    if reason:
         return RackPose(RackStatus.REFUSED, reason), ranking
+    rack, best = order[0]
     if hint is not None and hint.slot not in {slot.name for slot in rack.all_slots}:
         hint = None
     pose = pose_of(best, points_m, rack, config, hint, intrinsics)
-    return replace(pose, rack=rack, named_by_margin=1 - rival / ranking[0].evidence), ranking
+    return replace(pose, rack=rack, named_by_margin=1 - _rival(ranking) / ranking[0].evidence), ranking
+
+
+def _not_named(ranking: Sequence[RankedRack], known: int, config: Config) -> str:
+    """Why no rack can be named, in words; empty if the first one is it."""
+    if not ranking or ranking[0].reason:
+        told = "; ".join(f"{entry.rack.name}: {entry.reason}" for entry in ranking[:TOLD]) or "no level band at all"
+        return f"no rack of the {known} known ones fits; the nearest are {told}"
+    if ranking[0].evidence >= config.rack.min_rival_ratio * _rival(ranking):
+        return ""
+    told = ", ".join(f"{entry.rack.name} ({entry.evidence:.0f} nats)" for entry in ranking[:TOLD])
+    return f"more than one rack fits: {told}; a ratio of {config.rack.min_rival_ratio:g} expected: name it"
+
+
+def _rival(ranking: Sequence[RankedRack]) -> float:
+    """Evidence of the next rack after the first that passes every test; 0 without any."""
+    return max((entry.evidence for entry in ranking[1:] if not entry.reason), default=0.0)
 
 
 def _registrations(
