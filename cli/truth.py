@@ -82,10 +82,15 @@ def measure_sessions(
     tables = TruthTables()
     with pinned_threads(1), progress("ground truth", sum(len(s.trials) for s in sessions)) as step:
         for session in sessions:
-            if exact:
-                tables.truth += exact_truth_rows(session)
-            else:
+            if not exact:
                 measure_session(session, tables, config, fail_fast=fail_fast, on_done=step)
+                continue
+            try:
+                tables.truth += exact_truth_rows(session)
+            except TubePoseError as problem:
+                if fail_fast:
+                    raise
+                tables.problems.append(str(problem))
     truth, floor = to_table(tables.truth, TRUTH_COLUMNS), to_table(tables.floor, FLOOR_COLUMNS)
     write_csv(out / "ground_truth.csv", truth)
     notes = [EXACT_NOTE if exact else refused_note(truth)]

@@ -82,6 +82,7 @@ ALLOWED: dict[str, set[str]] = {
     "pose_errors": set(),
     "evaluation": {"labware", "pose_errors", "statistics"},
     "uncertainty": {"pose_errors", "statistics"},
+    "confusion": set(),
     "truth_tables": {
         "batch",
         "records",

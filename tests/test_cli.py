@@ -30,6 +30,7 @@ from tubepose.labware import load_rack, load_tube
 from tubepose.records import ESTIMATE_COLUMNS, POSE_COLUMNS, RACK_COLUMNS, SLOT_COLUMNS, TIMING_COLUMNS
 from tubepose.simulation import SceneVariation
 from tubepose.transforms import FloatArray
+from tubepose.uncertainty import COVERAGE_COLUMNS, UNCERTAINTY_COLUMNS
 from tubepose_cli.show import describe_tubes, progress
 
 KNOWN = ("--rack", SMALL_RACK, "--tubes", SMALL_TUBES[1])
@@ -584,6 +585,54 @@ def test_a_known_rack_is_not_registered(small_session: Path, tmp_path: Path) -> 
     assert "its pose given" in ended.out
     assert set(table(tmp_path / "out" / "racks.csv")["resolved_by"]) == {"given"}
     assert "rack" not in set(table(tmp_path / "out" / "timings.csv")["stage"])
+
+
+def test_exact_poses_judge_without_printed_caps_and_the_bytes_repeat(small_session: Path, tmp_path: Path) -> None:
+    arguments = ("bench", small_session, "--exact-truth", "--methods", "profile,upright", "--out")
+    ended = tubepose(*arguments, tmp_path / "out")
+    assert (ended.code, ended.errors) == (0, [])
+    assert "Truth: the exact poses of the simulation, not those measured from printed caps." in ended.out
+    out = tmp_path / "out"
+    assert not (out / "ground_truth_floor.csv").exists()
+    truth, errors = table(out / "ground_truth.csv"), table(out / "errors.csv")
+    assert set(truth["reason"]) == {"exact"}
+    assert len(truth) == 4
+    assert set(errors["outcome"]) == {"ok"}
+    assert len(errors) == 8
+    of_profile = errors[errors["method"] == "profile"]
+    assert (of_profile["mahalanobis2"].astype(float) >= 0).all()
+    assert set(errors.loc[errors["method"] == "upright", "mahalanobis2"]) == {""}
+    assert (of_profile["tilt_deg"].astype(float) < 0.6).all()
+    assert columns(out / "uncertainty.csv") == list(UNCERTAINTY_COLUMNS)
+    assert columns(out / "coverage.csv") == list(COVERAGE_COLUMNS)
+    honest = table(out / "uncertainty.csv")
+    assert set(honest["method"]) == {"profile"}
+    assert set(honest["tube"]) == {*SMALL_TUBES, "all"}
+    assert honest.loc[honest["tube"] == "all", "n"].tolist() == [4]
+    assert "% of 4 truths inside the stated 95 % region" in ended.out
+    assert tubepose(*arguments, tmp_path / "again").code == 0
+    first, second = digests(out), digests(tmp_path / "again")
+    assert set(first) == set(second)
+    changed = {name for name in first if first[name] != second[name]}
+    assert all(name == "run.json" or "timing" in name for name in changed)
+
+
+def test_exact_poses_of_a_recorded_session_are_one_line_and_the_others_are_done(
+    small_session: Path, tmp_path: Path
+) -> None:
+    recorded = edited(
+        small_session,
+        tmp_path / "recorded",
+        lambda text: text.replace("origin: simulated", "origin: recorded").replace("name: raycast", "name: real"),
+    )
+    arguments = ("bench", recorded, small_session, "--exact-truth", "--methods", "upright", "--out", tmp_path / "out")
+    ended = tubepose(*arguments)
+    assert ended.code == 1
+    (line,) = ended.errors
+    assert "is recorded: only simulated ones know exact poses" in line
+    assert len(table(tmp_path / "out" / "ground_truth.csv")) == 4
+    stopped = tubepose(*arguments, "--fail-fast")
+    one_error(stopped, "is recorded: only simulated ones know exact poses")
 
 
 def test_sessions_of_one_name_are_not_mixed_up(small_session: Path, tmp_path: Path) -> None:

@@ -1,8 +1,10 @@
 """The stages together: from a frame with known poses to estimates, and what each stage hands on when it fails."""
 
+import dataclasses
 from dataclasses import dataclass
 
 import numpy as np
+import profile_scenes as ps
 import pytest
 import scenes
 
@@ -11,9 +13,19 @@ from tubepose.config import Config
 from tubepose.detection import Detection
 from tubepose.detection.geometric import GeometricDetector
 from tubepose.labware import load_rack, load_tube
-from tubepose.pipeline import DEFAULT_METHOD, METHODS, STOCHASTIC, TUBE_METHODS, estimate_tubes, prepare_scene
+from tubepose.pipeline import (
+    DEFAULT_METHOD,
+    METHODS,
+    STOCHASTIC,
+    TUBE_METHODS,
+    allowed_types,
+    estimate_tubes,
+    prepare_scene,
+)
 from tubepose.rack import RackStatus
+from tubepose.records import slot_rows
 from tubepose.rivals import PACKAGES
+from tubepose.simulation.camera import default_camera
 from tubepose.transforms import make_transform, tilt_rad, transform_points
 from tubepose.tube import TubeStatus
 
@@ -241,3 +253,124 @@ def test_points_in_the_box_that_no_such_tube_can_own_do_not_reach_the_fit():
     above = np.sum(own[:, 2] > RACK.height_m + CONFIG.slots.clearance_m)
     assert len(target.points_m) == pytest.approx(above, abs=0.01 * above)
     assert target.points_m[:, 2].max() < RACK.floor_m + tube.height_m + 1e-3
+
+
+# The method that looks at the whole frame
+
+
+@pytest.fixture(scope="module")
+def seen():
+    """A ray cast frame of the placed tubes, each looked at by `profile` with its rack's pose given."""
+    frame = ps.rendered(RACK, PLACED, T_CAMERA_RACK)
+    return prepare_scene(frame, RACK, TUBES, Fixed(()), CONFIG, T_camera_rack=T_CAMERA_RACK, methods=("profile",))
+
+
+def test_profile_needs_neither_boxes_nor_the_slots_of_others(seen):
+    assert seen.targets == ()
+    assert [time.stage for time in seen.times] == ["detect"]
+    estimates, times = estimate_tubes(seen, "profile", CONFIG)
+    assert {e.target.slot: e.target.tube for e in estimates} == {slot: tube for slot, (tube, _) in PLACED.items()}
+    assert {(e.method, e.seed, e.target.detection, e.target.reason) for e in estimates} == {("profile", None, None, "")}
+    assert [time.instance for time in times] == [estimate.target.slot for estimate in estimates]
+    assert len({time.duration_ms for time in times}) == 1
+    for estimate in estimates:
+        _, T_rack_tube = PLACED[estimate.target.slot]
+        assert estimate.pose.status is TubeStatus.OK
+        T_camera_tube = T_CAMERA_RACK @ T_rack_tube
+        assert np.rad2deg(tilt_rad(estimate.T_camera_tube[:3, 2], T_camera_tube[:3, 2])) < 0.35
+        assert np.allclose(estimate.T_camera_tube, T_CAMERA_RACK @ estimate.pose.T_rack_tube)
+        assert 0 < estimate.target.share <= 1
+        assert len(estimate.target.points_m) == estimate.pose.n_points
+
+
+def test_other_methods_still_have_their_targets_beside_profile():
+    found = prepare_scene(
+        frame_of(),
+        RACK,
+        TUBES,
+        GeometricDetector(RACK, TUBES),
+        CONFIG,
+        hint_for(T_CAMERA_RACK),
+        methods=("profile", "paper"),
+    )
+    assert {target.slot for target in found.targets} == set(PLACED)
+    alone = prepare_scene(
+        frame_of(), RACK, TUBES, GeometricDetector(RACK, TUBES), CONFIG, hint_for(T_CAMERA_RACK), methods=("profile",)
+    )
+    assert alone.targets == ()
+
+
+def test_profile_without_a_rack_or_types_invents_nothing(seen):
+    lost = prepare(frame_of(), detector=Fixed(()))
+    assert estimate_tubes(lost, "profile", CONFIG) == ((), ())
+    bare = prepare_scene(seen.frame, RACK, (), Fixed(()), CONFIG, T_camera_rack=T_CAMERA_RACK, methods=("profile",))
+    assert estimate_tubes(bare, "profile", CONFIG) == ((), ())
+
+
+def test_a_tube_across_the_rack_is_no_target_of_profile_but_a_row_with_a_reason():
+    lying = np.random.default_rng(0).uniform([-45, -8, 68], [45, 8, 72], (20_000, 3)) * 1e-3
+    points = transform_points(T_CAMERA_RACK, np.vstack([scenes.rack_top(RACK), lying]))
+    found = prepare_scene(
+        scenes.unorganised(points), RACK, TUBES, Fixed(()), CONFIG, T_camera_rack=T_CAMERA_RACK, methods=("profile",)
+    )
+    (estimate,), (time,) = estimate_tubes(found, "profile", CONFIG)
+    assert (estimate.target.slot, estimate.target.tube, estimate.T_camera_tube) == (None, None, None)
+    assert estimate.target.reason == estimate.pose.reason
+    assert estimate.pose.reason.startswith("lies across the rack: ")
+    assert time.instance == ""
+    rows = slot_rows({}, "profile", found, (estimate,))
+    assert not any(row["occupied"] for row in rows)
+
+
+def test_a_slot_with_two_finds_has_one_row_and_it_is_the_first(seen):
+    estimates, _ = estimate_tubes(seen, "profile", CONFIG)
+    first = estimates[0]
+    second = dataclasses.replace(
+        first,
+        target=dataclasses.replace(first.target, tube=None, reason="a second top"),
+        pose=dataclasses.replace(first.pose, status=TubeStatus.REJECTED, reason="a second top", T_rack_tube=None),
+    )
+    rows = slot_rows({}, "profile", seen, (*estimates, second))
+    (row,) = [row for row in rows if row["slot"] == first.target.slot]
+    assert (row["tube"], row["status"], row["occupied"]) == (first.target.tube.name, "ok", True)
+    assert sum(row["occupied"] for row in rows) == len(estimates)
+
+
+# What a detector's classes say of the types
+
+
+def top_box(slot, tube, class_name, half_px=14.0, off_px=0.0):
+    top = np.array([*RACK.slot(slot).center_m, RACK.floor_m + tube.height_m])
+    u, v = seen_camera().project(transform_points(T_CAMERA_RACK, top)) + off_px
+    return Detection(class_name, 0.9, (u - half_px, v - half_px, u + half_px, v + half_px), "recorded")
+
+
+def seen_camera():
+    return default_camera(700).intrinsics
+
+
+def told(seen, *boxes):
+    return allowed_types(dataclasses.replace(seen, detections=boxes))
+
+
+def test_a_box_of_a_known_class_leaves_its_slot_that_type_alone(seen):
+    may = told(seen, top_box("C5", TUBES[2], "white-cap"), top_box("A1", TUBES[0], "chen2023-tube-1", off_px=3.0))
+    names = [slot.name for slot in RACK.all_slots]
+    assert may[:, names.index("C5")].tolist() == [False, False, True]
+    assert may[:, names.index("A1")].tolist() == [True, False, False]
+    others = [i for i, name in enumerate(names) if name not in ("C5", "A1")]
+    assert may[:, others].all()
+
+
+def test_boxes_that_say_no_type_leave_all(seen):
+    nowhere = Detection("white-cap", 0.9, (np.nan,) * 4, "recorded", np.arange(3))
+    assert told(seen) is None
+    assert told(seen, top_box("C5", TUBES[2], "tube"), top_box("C5", TUBES[2], "rack"), nowhere) is None
+    far = Detection("white-cap", 0.9, (0.0, 0.0, 4.0, 4.0), "recorded")
+    assert told(seen, far).all()
+
+
+def test_a_wrong_class_costs_its_tube_and_no_other(seen):
+    wrong = dataclasses.replace(seen, detections=(top_box("E10", TUBES[1], "purple-cap"),))
+    ok = {e.target.slot for e in estimate_tubes(wrong, "profile", CONFIG)[0] if e.pose.status is TubeStatus.OK}
+    assert ok == {"A1", "C5"}

@@ -20,6 +20,7 @@ from tubepose.truth_tables import (
     FLOOR_COLUMNS,
     TRUTH_COLUMNS,
     TruthTables,
+    exact_truth_rows,
     floor_note,
     measure_session,
     refused_note,
@@ -134,6 +135,34 @@ def test_the_exact_rack_is_not_to_be_had_elsewhere(small_session: Path, tmp_path
     session = load_session(tmp_path / "s")
     with pytest.raises(CaptureError, match=r"simulation_truth/blood-16x100-001\.yaml: no such file"):
         with_exact_rack(session_jobs(session)[0], session)
+
+
+# The tubes' exact poses
+
+
+def test_exact_rows_are_the_simulations_own_poses(small_session: Path) -> None:
+    session = load_session(small_session)
+    rows = exact_truth_rows(session)
+    declared = [(trial.name, slot, tube) for trial in session.trials for slot, tube in trial.tubes.items()]
+    assert [(row["trial"], row["slot"], row["tube"]) for row in rows] == declared
+    assert {(row["session"], row["status"], row["reason"]) for row in rows} == {(session.name, "ok", "exact")}
+    for row in rows:
+        exact = read_exact_truth(small_session, row["trial"]).tubes[row["slot"]][1]
+        assert pose_of(row) == pytest.approx(exact, abs=1e-12)
+    assert list(to_table(rows, TRUTH_COLUMNS)) == list(TRUTH_COLUMNS)
+
+
+def test_exact_rows_are_not_to_be_had_elsewhere(small_session: Path, tmp_path: Path) -> None:
+    recorded = load_session(edited(small_session, tmp_path / "r", "origin: simulated", "origin: recorded"))
+    words = rf"^session {recorded.name} is recorded: only simulated ones know exact poses$"
+    with pytest.raises(ConfigError, match=words):
+        exact_truth_rows(recorded)
+    session = load_session(small_session)
+    (slot, *_) = session.trials[0].tubes
+    free = next(known.name for known in session.rack.all_slots if known.name not in session.trials[0].tubes)
+    moved = load_session(edited(small_session, tmp_path / "m", f"{{{slot}: ", f"{{{free}: "))
+    with pytest.raises(CaptureError, match=f"a tube is declared in slot {free}, but its exact truth has none there"):
+        exact_truth_rows(moved)
 
 
 # In words

@@ -133,6 +133,7 @@ def exact_truth_rows(session: Session) -> list[Row]:
 
     Raises:
         ConfigError: The session is recorded.
+        CaptureError: Its exact truth is not there, or knows nothing of a declared tube.
     """
     if session.origin != "simulated":
         raise ConfigError(f"session {session.name} is recorded: only simulated ones know exact poses")
@@ -141,6 +142,9 @@ def exact_truth_rows(session: Session) -> list[Row]:
         exact = read_exact_truth(session.folder, trial.name)
         keys: Row = {"session": session.name, "trial": trial.name, "capture": "", "status": "ok", "reason": "exact"}
         for slot, name in trial.tubes.items():
+            if slot not in exact.tubes:
+                where = f"session {session.name}, trial {trial.name}"
+                raise CaptureError(f"{where}: a tube is declared in slot {slot}, but its exact truth has none there")
             T_camera_tube = exact.tubes[slot][1]
             rows.append({**keys, "slot": slot, "tube": session.tubes[name].name, **pose_columns(T_camera_tube)})
     return rows
