@@ -228,7 +228,7 @@ def documented(name: str) -> set[str]:
     "name",
     [
         "racks", "slots", "estimates", "timings", "ground_truth", "errors", "summary", "comparison", "seeds",
-        "slot_accuracy",
+        "slot_accuracy", "uncertainty", "coverage", "confusion",
     ],
 )  # fmt: skip
 def test_the_page_and_the_file_have_the_same_columns(name: str, benched: tuple[Path, Ended]) -> None:
@@ -685,7 +685,6 @@ def test_boxes_from_elsewhere_give_the_same_slots(
     ended = tubepose(
         "estimate", original(small_session), *KNOWN, "--detector", source, *place, "--no-overlays",
         "--hint", f"{hint['slot']}@{hint['pixel'][0]},{hint['pixel'][1]}", "--out", tmp_path / "out",
-        "--method", "paper",
     )  # fmt: skip
     assert (ended.code, ended.errors, "ambiguous" in ended.err) == (0, [], False)
     slots, wanted = table(tmp_path / "out" / "slots.csv"), table(estimated[0] / "slots.csv")
