@@ -74,7 +74,7 @@ def test_what_is_told_of_a_tube(found):
         assert np.linalg.eigvalsh(pose.covariance).min() > 0
         assert pose.covariance == pytest.approx(pose.covariance.T)
         R = pose.T_rack_tube[:3, :3]
-        assert R @ R.T == pytest.approx(np.eye(3))
+        assert pytest.approx(np.eye(3)) == R @ R.T
         assert entry.tube.is_open is bool(np.isnan(pose.inlier_rmse_m))
         assert 0.4 <= pose.fitness <= 1
 
