@@ -156,7 +156,7 @@ def _top_score(
     kernel = top / top.sum() - around / around.sum()
     if mouth:
         core = r < mouth - 1.5e-3
-        kernel = kernel - 0.5 * core / core.sum()
+        kernel = kernel - core / core.sum()
     score = _filter(filled, kernel)
     if tube.is_open:
         return score
