@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from tubepose.capture.frame import CameraIntrinsics, RgbdFrame
 from tubepose.config import Config, ProfileConfig
 from tubepose.labware import RackModel, TubeModel
+from tubepose.profile.kernels import cell_values, near_planes
 from tubepose.profile.outline import NORMALS, OUTLINE_DEPTH_M, Circles, fit_discs, unknown_circles
 from tubepose.profile.plane import TopPlanes, fit_top_planes
 from tubepose.profile.rims import fit_rims
@@ -163,10 +164,8 @@ def label_points(standing: Standing, center_m: FloatArray, radius_m: FloatArray)
         closer = (distance < nearest[window]) & (distance < radius + NEAR_TOP_M)
         label[window][closer] = i
         nearest[window][closer] = distance[closer]
-    cells = np.rint((standing.points_m[:, :2] - low) / LABEL_CELL_M).astype(np.intp)
-    np.clip(cells, 0, size - 1, out=cells)
     # The picture's border belongs to no top.
-    return np.asarray(label.reshape(-1)[cells[:, 0] * size[1] + cells[:, 1]])
+    return np.asarray(cell_values(standing.points_m, low, LABEL_CELL_M, label))
 
 
 def blocked_sectors(
@@ -191,11 +190,10 @@ def _measure_closed(
 
     A circle needs the points near its end alone.
     """
-    closed = np.append(~shape.open, False)
-    near_m = np.abs(standing.points_m[:, 2] - np.append(shape.level_m, np.inf)[label])
-    mine = np.flatnonzero(closed[label] & (near_m < config.top_band_m))
-    of, points_m = label[mine], standing.points_m[mine]
-    offset = points_m[:, :2] - tops.center_m[of]
+    rows, of, offset = near_planes(
+        standing.points_m, label, tops.center_m, shape.level_m, config.top_band_m, ~shape.open
+    )
+    points_m = standing.points_m[rows]
     planes = fit_top_planes(of, offset, points_m[:, 2], shape.level_m, shape.radius_m, config)
     outer = np.flatnonzero(np.einsum("ij,ij->i", offset, offset) > (shape.radius_m - OUTLINE_DEPTH_M)[of] ** 2)
     of, points_m = of[outer], points_m[outer]

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tubepose.config import ProfileConfig
+from tubepose.profile.kernels import sector_counts
 from tubepose.transforms import FloatArray
 
 SECTORS = 24
@@ -94,7 +95,7 @@ def fit_discs(
     shift = np.zeros((count, 2))
     circles = None
     for inside_m, outside_m in WIDTHS_M:
-        end_m, seen, counting_m = _sector_ends(label, offset_m - shift[label], radius_m, inside_m, outside_m)
+        end_m, seen, counting_m = _sector_ends(label, offset_m, shift, radius_m, inside_m, outside_m)
         sigma_m = np.hypot(config.outline_noise_m, counting_m)
         circles = fit_circles(end_m - radius_m[:, None], seen & ~blocked, config, sigma_m, config.outline_bias_m)
         shift += np.nan_to_num(circles.offset_m)
@@ -108,32 +109,27 @@ def fit_discs(
 
 
 def _sector_ends(
-    label: NDArray[np.intp], offset_m: FloatArray, radius_m: FloatArray, inside_m: float, outside_m: float
+    label: NDArray[np.intp],
+    offset_m: FloatArray,
+    shift_m: FloatArray,
+    radius_m: FloatArray,
+    inside_m: float,
+    outside_m: float,
 ) -> tuple[FloatArray, NDArray[np.bool_], FloatArray]:
     """Radius at which each sector ends, shape (T, SECTORS), metres, and whether it is filled up to there.
 
     The end is where the points of the sector would end if they lay as dense as those further in. The last is what
     counting few points adds to its error, shape (T,), metres: 0 but in a coarse scan.
     """
-    count = len(radius_m)
-    rho = np.hypot(*offset_m.T)
-    sector = ((np.arctan2(offset_m[:, 1], offset_m[:, 0]) + np.pi) / (2 * np.pi) * SECTORS).astype(np.intp) % SECTORS
-    place = label * SECTORS + sector
     width = 2 * np.pi / SECTORS
-    low = radius_m - inside_m
-
-    def between(inner_m: FloatArray, outer_m: FloatArray) -> NDArray[np.intp]:
-        chosen = (rho > inner_m[label]) & (rho <= outer_m[label])
-        return np.bincount(place[chosen], minlength=count * SECTORS).reshape(count, SECTORS)
-
-    counted = between(low, radius_m + outside_m)
+    low, high = radius_m - inside_m, radius_m + outside_m
     lower = low - DENSITY_BAND_M
-    core = between(lower, low)
+    core, counted = sector_counts(label, offset_m, shift_m, lower, low, high, SECTORS)
     usual = np.median(core, axis=1)
     coarse = usual <= MIN_CORE_POINTS
     if coarse.any():
         lower = np.where(coarse, low - COARSE_BAND_M, lower)
-        core = between(lower, low)
+        core, _ = sector_counts(label, offset_m, shift_m, lower, low, high, SECTORS)
         filled = core > 0.5 * np.median(core, axis=1)[:, None]
         mean = (core * filled).sum(axis=1) / np.maximum(filled.sum(axis=1), 1)
         usual = np.where(coarse, mean, usual)

@@ -8,9 +8,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tubepose.config import ProfileConfig
+from tubepose.profile.kernels import plane_sums
 from tubepose.transforms import FloatArray
 
 ROUNDS = 4
+LEAST_SIGMA_M = 3.0e-5
+"""No sensor is better: points on a perfect plane must not be thrown out for rounding."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -64,26 +67,22 @@ def fit_top_planes(
     inside &= np.abs(height_m - expected_m[label]) < config.top_band_m
     label, xy, z = label[inside], offset_m[inside], height_m[inside]
     step = max(1, len(z) // max(config.plane_points * count, 1))
-    start = _median_per_label(label[::step], z[::step], expected_m)
-    coefficients = np.column_stack([start, np.zeros((count, 2))])
+    planes = np.column_stack([_median_per_label(label[::step], z[::step], expected_m), np.zeros((count, 2))])
     sigma = np.full(count, config.top_band_m / 3)
-    weight = np.empty(0)
-    for some in (*[np.s_[::step]] * ROUNDS, np.s_[:]):
-        of, x, y, value = label[some], xy[some, 0], xy[some, 1], z[some]
-        residual = value - coefficients[of, 0] - coefficients[of, 1] * x - coefficients[of, 2] * y
-        u = residual / (4.0 * sigma[of])
-        weight = np.where(np.abs(u) < 1, (1 - u * u) ** 2, 0.0)
-        coefficients = _solve(of, (x, y), value, weight, coefficients, config)
-        sigma = _scale(of, residual, weight, count)
-    n = np.bincount(label, weight > 0, minlength=count).astype(np.intp)
+    n = np.zeros(count, np.intp)
+    for every in (*[step] * ROUNDS, 1):
+        sums = plane_sums(label, xy, z, planes, sigma, every)
+        planes = _solve(sums, planes, config)
+        sigma = np.maximum(np.sqrt(sums[:, 9] / np.maximum(sums[:, 0], 1e-9)), LEAST_SIGMA_M)
+        n = sums[:, 10].astype(np.intp)
     enough = n >= config.min_top_points
     lever2 = radius_m**2 / 4
     # One independent shared error per patch of the error's reach.
     patches = np.maximum((radius_m / config.shared_error_reach_m) ** 2, 3.0)
     slope_var = (sigma**2 / np.maximum(n, 3) + config.shared_error_m**2 / patches) / lever2
     return TopPlanes(
-        np.where(enough, coefficients[:, 0], np.nan),
-        np.where(enough[:, None], coefficients[:, 1:], np.nan),
+        np.where(enough, planes[:, 0], np.nan),
+        np.where(enough[:, None], planes[:, 1:], np.nan),
         slope_var,
         np.where(enough, sigma, np.nan),
         n,
@@ -99,31 +98,10 @@ def _median_per_label(label: NDArray[np.intp], values: FloatArray, default: Floa
     return np.where(counts > 0, values[order][middle], default) if len(values) else default.copy()
 
 
-def _solve(
-    label: NDArray[np.intp],
-    xy_m: tuple[FloatArray, FloatArray],
-    values: FloatArray,
-    weight: FloatArray,
-    before: FloatArray,
-    config: ProfileConfig,
-) -> FloatArray:
-    """Weighted least squares of every label, shape (T, 3); as before where there are too few points."""
-    count = len(before)
-    normal, right = np.empty((count, 3, 3)), np.empty((count, 3))
-    basis = (None, *xy_m)
-    for i, column in enumerate(basis):
-        scaled = weight if column is None else weight * column
-        right[:, i] = np.bincount(label, scaled * values, minlength=count)
-        for j, other in enumerate(basis[i:], i):
-            entry = np.bincount(label, scaled if other is None else scaled * other, minlength=count)
-            normal[:, i, j] = normal[:, j, i] = entry
-    usable = (normal[:, 0, 0] >= config.min_top_points / 4) & (np.linalg.det(normal) > 0)
+def _solve(sums: FloatArray, before: FloatArray, config: ProfileConfig) -> FloatArray:
+    """Planes from the sums of `plane_sums`, shape (T, 3); as before where there are too few points."""
+    normal = sums[:, [0, 1, 2, 1, 3, 4, 2, 4, 5]].reshape(-1, 3, 3)
+    usable = (sums[:, 0] >= config.min_top_points / 4) & (np.linalg.det(normal) > 0)
     normal[~usable] = np.eye(3)
-    solved = np.linalg.solve(normal, right[..., None])[..., 0]
+    solved = np.linalg.solve(normal, sums[:, 6:9, None])[..., 0]
     return np.where(usable[:, None], solved, before)
-
-
-def _scale(label: NDArray[np.intp], residual: FloatArray, weight: FloatArray, count: int) -> FloatArray:
-    """Weighted rms of the residuals of every label, at least 0.03 mm, shape (T,), metres."""
-    total = np.maximum(np.bincount(label, weight, minlength=count), 1e-9)
-    return np.maximum(np.sqrt(np.bincount(label, weight * residual**2, minlength=count) / total), 3e-5)

@@ -62,8 +62,9 @@ def pivot_m(tube: TubeModel) -> float:
 
 def per_model(models: Sequence[TubeModel], value: Callable[[TubeModel], object]) -> FloatArray:
     """A value of every tube's model, computed once per model, as an array."""
-    known = {id(model): value(model) for model in models}
-    return np.array([known[id(model)] for model in models], dtype=float)
+    known = {id(model): model for model in models}
+    values = {key: value(model) for key, model in known.items()}
+    return np.array([values[id(model)] for model in models], dtype=float)
 
 
 def no_evidence(count: int) -> Evidence:

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from tubepose.capture.frame import CameraIntrinsics, RgbdFrame
 from tubepose.labware import RackModel
+from tubepose.profile.kernels import points_over
 from tubepose.transforms import FloatArray, invert_transform, transform_points
 
 OUTSIDE_M = 0.012
@@ -76,11 +77,7 @@ def gather_standing(
             low, high = np.floor(uv.min(axis=0)).astype(int), np.ceil(uv.max(axis=0)).astype(int) + 1
             left, right = np.clip([low[0], high[0]], 0, width)
             top, bottom = np.clip([low[1], high[1]], 0, height)
-    part = frame.cloud_m[top:bottom, left:right].reshape(-1, 3)
-    # The height first: one product with every point instead of three.
-    z = part @ T_rack_camera[2, :3] + T_rack_camera[2, 3]
-    with np.errstate(invalid="ignore"):
-        kept = np.flatnonzero((z > lowest_m) & (z < highest_m))
-    points = transform_points(T_rack_camera, part[kept])
-    near = (np.abs(points[:, 0]) < half[0]) & (np.abs(points[:, 1]) < half[1])
-    return Standing(points[near], T_rack_camera[:3, 3])
+    points = points_over(
+        frame.cloud_m[top:bottom, left:right], T_rack_camera[:3, :3], T_rack_camera[:3, 3], lowest_m, highest_m, half
+    )
+    return Standing(points, T_rack_camera[:3, 3])

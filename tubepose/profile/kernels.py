@@ -1,0 +1,114 @@
+"""The loops over points, compiled: one pass each instead of a dozen arrays. The machine code is kept (`cache=True`).
+
+Sums are made in the order of the points, so results do not depend on threads; arguments are changed in none of them.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit
+
+
+@njit(cache=True)
+def points_over(cloud_m, rotation, translation_m, lowest_m, highest_m, half_m):
+    """Points of a cloud (H, W, 3) in the rack's frame, shape (N, 3), between two heights and over the outline."""
+    height, width = cloud_m.shape[0], cloud_m.shape[1]
+    points = np.empty((height * width, 3))
+    count = 0
+    for i in range(height):
+        for j in range(width):
+            x, y, z = cloud_m[i, j, 0], cloud_m[i, j, 1], cloud_m[i, j, 2]
+            up = rotation[2, 0] * x + rotation[2, 1] * y + rotation[2, 2] * z + translation_m[2]
+            # False for NaN.
+            if lowest_m < up < highest_m:
+                right = rotation[0, 0] * x + rotation[0, 1] * y + rotation[0, 2] * z + translation_m[0]
+                ahead = rotation[1, 0] * x + rotation[1, 1] * y + rotation[1, 2] * z + translation_m[1]
+                if abs(right) < half_m[0] and abs(ahead) < half_m[1]:
+                    points[count, 0], points[count, 1], points[count, 2] = right, ahead, up
+                    count += 1
+    return points[:count].copy()
+
+
+@njit(cache=True)
+def cell_values(points_m, low_m, cell_m, picture):
+    """Value of each point's cell in a picture (X, Y) whose cell 0, 0 has its middle at `low_m`; the border's outside."""
+    values = np.empty(len(points_m), picture.dtype)
+    for k in range(len(points_m)):
+        # Left of the picture too: what is cut towards 0 is outside.
+        x = int((points_m[k, 0] - low_m[0]) / cell_m + 0.5)
+        y = int((points_m[k, 1] - low_m[1]) / cell_m + 0.5)
+        x = min(max(x, 0), picture.shape[0] - 1)
+        y = min(max(y, 0), picture.shape[1] - 1)
+        values[k] = picture[x, y]
+    return values
+
+
+@njit(cache=True)
+def near_planes(points_m, label, centers_m, levels_m, band_m, usable):
+    """Rows of the points whose tube is usable and whose height is near its level; their tubes and offsets (N, 2)."""
+    rows = np.empty(len(points_m), np.intp)
+    count = 0
+    for k in range(len(points_m)):
+        t = label[k]
+        if t >= 0 and usable[t] and abs(points_m[k, 2] - levels_m[t]) < band_m:
+            rows[count] = k
+            count += 1
+    rows = rows[:count].copy()
+    of = np.empty(count, np.intp)
+    offset_m = np.empty((count, 2))
+    for i in range(count):
+        k = rows[i]
+        of[i] = label[k]
+        offset_m[i, 0] = points_m[k, 0] - centers_m[of[i], 0]
+        offset_m[i, 1] = points_m[k, 1] - centers_m[of[i], 1]
+    return rows, of, offset_m
+
+
+@njit(cache=True)
+def plane_sums(label, offset_m, height_m, planes, sigma_m, step):
+    """Sums of Tukey's weights w about planes (T, 3), shape (T, 11): of every `step`-th point.
+
+    In order: w, wx, wy, wxx, wxy, wyy, wz, wxz, wyz, w times the squared residual, and the number of points.
+    """
+    sums = np.zeros((len(planes), 11))
+    for k in range(0, len(label), step):
+        t = label[k]
+        x, y, z = offset_m[k, 0], offset_m[k, 1], height_m[k]
+        residual = z - planes[t, 0] - planes[t, 1] * x - planes[t, 2] * y
+        u = residual / (4.0 * sigma_m[t])
+        if abs(u) < 1.0:
+            w = (1.0 - u * u) ** 2
+            row = sums[t]
+            row[0] += w
+            row[1] += w * x
+            row[2] += w * y
+            row[3] += w * x * x
+            row[4] += w * x * y
+            row[5] += w * y * y
+            row[6] += w * z
+            row[7] += w * x * z
+            row[8] += w * y * z
+            row[9] += w * residual * residual
+            row[10] += 1.0
+    return sums
+
+
+@njit(cache=True)
+def sector_counts(label, offset_m, shift_m, lower_m, low_m, high_m, sectors):
+    """Points of every tube and sector between `lower` and `low`, and between `low` and `high`: two (T, sectors)."""
+    core = np.zeros((len(low_m), sectors), np.intp)
+    edge = np.zeros((len(low_m), sectors), np.intp)
+    scale = sectors / (2.0 * math.pi)
+    for k in range(len(label)):
+        t = label[k]
+        x, y = offset_m[k, 0] - shift_m[t, 0], offset_m[k, 1] - shift_m[t, 1]
+        rho = math.sqrt(x * x + y * y)
+        if lower_m[t] < rho <= high_m[t]:
+            sector = int((math.atan2(y, x) + math.pi) * scale) % sectors
+            if rho <= low_m[t]:
+                core[t, sector] += 1
+            else:
+                edge[t, sector] += 1
+    return core, edge
