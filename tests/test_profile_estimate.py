@@ -235,6 +235,16 @@ def test_without_an_image_the_rims_are_looked_for_in_the_depth(frame):
         assert found[slot].pose.reason or found[slot].pose.status is TubeStatus.OK
 
 
+def test_rims_that_the_image_does_not_show_are_told_of_and_refused(frame):
+    dark = dataclasses.replace(frame, image=np.zeros_like(frame.image))
+    found = ps.by_slot(ps.fit(dark, VIEW, RACK, TUBES))
+    assert set(found) == set(PLACED)
+    for slot, (tube, _) in PLACED.items():
+        assert found[slot].tube == tube
+        words = "0% of the top's circle seen, at least 40% expected" if tube.is_open else ""
+        assert found[slot].pose.reason == words
+
+
 # What is refused
 
 

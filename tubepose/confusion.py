@@ -15,8 +15,8 @@ def confusion(errors: pd.DataFrame) -> pd.DataFrame:
         errors: Rows of errors.csv; false estimates have no true type and are left out.
 
     Returns:
-        Rows of confusion.csv, first seeds only: accepted and rejected answers by the type that they claim; ``none`` where
-        there is no answer, or one of unknown type.
+        Rows of confusion.csv, first seeds only: accepted and rejected answers by the type that they claim; ``none``
+        where there is no answer, or one of unknown type.
     """
     rows = errors[(errors["outcome"] != "false") & (errors["seed"].isna() | (errors["seed"] == 0))]
     told = rows.assign(tube_estimated=rows["tube_estimated"].where(rows["outcome"] != "missed").fillna(NO_TYPE))

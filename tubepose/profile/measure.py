@@ -26,6 +26,8 @@ DISC_GAP_M = 0.9e-3
 RIM_GAP_M = 0.6e-3
 """Where another top is nearer than this, the end of a disc (the ring of a rim) is not told from the other's."""
 LABEL_CELL_M = 5.0e-4
+RING_SUPPORT = 0.6
+"""Points with this much support are a rim whatever the image shows."""
 NEAR_TOP_M = 2.5e-3
 """Points this far outside of a top can be of the wall below it."""
 
@@ -85,15 +87,11 @@ def measure_tops(
     tops = find_tops(standing, rack, tubes, config.profile, allowed)
     shape = _shapes(tops, tubes, rack)
     rims = _measure_rims(frame, intrinsics, T_camera_rack, tops, shape, config.profile)
-    # A rim of clear plastic has few points, and other things look like one in the image: both must speak for it. Where
-    # it cannot be looked at in an image, its points alone must, as those of a closed top.
-    measured = np.isfinite(rims.widening_m)
-    proven = np.where(
-        measured,
-        rims.sectors * tops.support >= config.profile.min_rim_evidence,
-        tops.support > config.profile.min_support,
-    )
-    kept = ~shape.open | proven
+    # A rim of clear plastic has few points, and other things look like one in the image: both must speak for it. Points
+    # that make a ring are told of without the image too, to say that something stands there.
+    alone = np.where(np.isfinite(rims.widening_m), RING_SUPPORT, config.profile.min_support)
+    kept = ~shape.open | (tops.support > alone)
+    kept |= rims.sectors * tops.support >= config.profile.min_rim_evidence
     tops, shape, rims = tops.take(kept), shape.take(kept), rims.take(kept)
     label = label_points(standing, tops.center_m, shape.radius_m)
     planes, discs = _measure_closed(standing, label, tops, shape, config.profile)
