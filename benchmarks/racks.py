@@ -196,10 +196,10 @@ def session_tables(folder: Path, trials: int | None, methods: Sequence[str], wro
             for method in methods:
                 if number == 0 and case == "rack's box":
                     ask(method, points, view, view.rack)
-                answer = ask(method, points, view, view.rack)
-                if case == TWO_RACKS and answer.wrong:
-                    # Both racks are there, and neither is asked for.
-                    answer = ask(method, points, _moved(view), view.rack)
+                # Of two racks that are there neither is asked for: the nearer one counts.
+                there = (view, _moved(view)) if case == TWO_RACKS else (view,)
+                asked = [ask(method, points, one, view.rack) for one in there]
+                answer = min(asked, key=lambda a: np.inf if a.error is None else float(np.abs(a.error[3:]).max()))
                 answers.setdefault((case, method), []).append(answer)
         for name in wrong_racks:
             for method in methods:

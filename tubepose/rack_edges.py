@@ -81,7 +81,7 @@ def best_registration(
         if hypothesis.worth < RIVAL_WORTH * worth or _known(hypothesis.T_camera_rack, found, rack):
             continue
         registration = register_at(points_m, hypothesis.T_camera_rack, rack, config.rack)
-        if not registration.reason and registration.agreement.coverage >= config.rack.clear_seen:
+        if not registration.reason and _clear(registration, config.rack):
             return registration
         registration = _level(registration, hypothesis.level, config.rack)
         if not registration.reason:
@@ -89,6 +89,12 @@ def best_registration(
         if not _known(registration.fit.T_camera_rack, found, rack):
             found.append(registration)
     return _likeliest(found, rack, config.rack)
+
+
+def _clear(registration: Registration, config: RackConfig) -> bool:
+    """Whether no other place needs to be looked at: much is seen, and hardly a point contradicts."""
+    seen = registration.agreement
+    return seen.coverage >= config.clear_seen and seen.in_slot <= config.max_stray_share / 2
 
 
 def _likeliest(found: list[Registration], rack: RackModel, config: RackConfig) -> Registration | None:
