@@ -33,7 +33,7 @@ def points_over(cloud_m, rotation, translation_m, lowest_m, highest_m, half_m):
 
 @njit(cache=True)
 def cell_values(points_m, low_m, cell_m, picture):
-    """Values (N,) of the points' cells in a picture (X, Y), the middle of cell 0, 0 at `low_m`; the border's outside."""
+    """Values (N,) of the cells of points in a picture (X, Y) whose cell 0, 0 lies at `low_m`; the border is outside."""
     values = np.empty(len(points_m), picture.dtype)
     for k in range(len(points_m)):
         # Left of the picture too: what is cut towards 0 is outside.
