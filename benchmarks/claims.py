@@ -1,6 +1,6 @@
 """What is claimed of method `profile`, claim by claim, from one run of `tubepose bench` on a simulated session.
 
-    tubepose bench data/test --out RUN --methods upright,profile,paper,slot-icp,global-icp,gicp,kiss-matcher --seeds 1
+    tubepose bench data/test --out RUN --seeds 1 --methods upright,profile,paper,slot-icp,global-icp,gicp,kiss-matcher
     python -m benchmarks.claims data/test RUN [--out CLAIMS]
 
 The run's estimates are judged twice: by the truth that printed caps gave (ground_truth.csv of the run), and by the exact

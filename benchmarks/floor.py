@@ -2,11 +2,11 @@
 
     python -m benchmarks.floor [--rack NAME] [--tubes NAME,...]
 
-Tubes are drawn as the simulator places them. An ideal estimator is told the middle of each top exactly, and the plane of
-a closed cap's top exactly; the cap sits crooked by the simulator's tolerance, and the floor lets the bottom stand off the
-slot's centre. It knows these laws and answers with the posterior mean, by importance weights over twenty thousand drawn
-tubes. The printed means are floors of the tables' R and T against the exact truth. Two more rows add what is measured of
-tops on `dev`: circles to 0.1 mm, planes with the shared error of neighbouring points.
+Tubes are drawn as the simulator places them. An ideal estimator is told the middle of each top exactly, and the plane
+of a closed cap's top exactly; the cap sits crooked by the simulator's tolerance, and the floor lets the bottom stand
+off the slot's centre. It knows these laws and answers with the posterior mean, by importance weights over twenty
+thousand drawn tubes. The printed means are floors of the tables' R and T against the exact truth. A second row per tube
+adds what is measured of tops on `dev`: circles to 0.1 mm, planes with the shared error of neighbouring points.
 """
 
 from __future__ import annotations

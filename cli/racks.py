@@ -83,8 +83,8 @@ def _sides(option: str, text: str) -> tuple[float, float]:
     return sides[0], sides[-1]
 
 
-def find_rack(capture: Capture, choice: RackChoice, config: Config) -> tuple[RackModel, str]:
-    """The rack of a capture whose rack is not named, from its first frame; and what to say about it.
+def find_rack(capture: Capture, choice: RackChoice, config: Config) -> tuple[RackModel, float]:
+    """The rack of a capture whose rack is not named, from its first frame; and the margin by which it was named.
 
     Raises:
         CaptureError: No rack can be named, or no slots are found; the reason holds the ranking.
@@ -105,8 +105,7 @@ def find_rack(capture: Capture, choice: RackChoice, config: Config) -> tuple[Rac
             pose, _ = name_rack(points_m, config, intrinsics=frame.intrinsics)
     if pose.rack is None or pose.T_camera_rack is None:
         raise CaptureError(f"{capture.path}: {pose.reason}")
-    margin = "" if choice.lattice is not None else f", by a margin of {pose.named_by_margin:.0%}"
-    return pose.rack, f"{capture.name}: rack {pose.rack.name} found{margin}"
+    return pose.rack, pose.named_by_margin
 
 
 def find_racks(
@@ -118,12 +117,13 @@ def find_racks(
     found, problems = [], []
     for job in jobs:
         try:
-            rack, words = find_rack(job.capture, choice, config)
+            rack, margin = find_rack(job.capture, choice, config)
         except TubePoseError as problem:
             if fail_fast:
                 raise
             problems.append(str(problem))
             continue
-        say(words)
-        found.append(replace(job, rack=rack))
+        by = f", by a margin of {margin:.0%}" if choice.auto else ""
+        say(f"{job.capture.name}: rack {rack.name} found{by}")
+        found.append(replace(job, rack=rack, named_by_margin=margin))
     return found, problems

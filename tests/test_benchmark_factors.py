@@ -23,7 +23,7 @@ SMALL = {
     "seed": 5,
     "tubes": [TUBE],
     "trials": 1,
-    "resolution": 512,
+    "resolution": 640,
     "sensor": "raycast",
     "scenes": {"fill": [0.06, 0.06]},
     "factors": {"base": {}, "label": {"scenes": {"label_share": 1}}},

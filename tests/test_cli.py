@@ -27,7 +27,15 @@ from tubepose.detection.box_writing import write_yolo_txt
 from tubepose.detection.geometric import GeometricDetector
 from tubepose.evaluation import AXES
 from tubepose.labware import load_rack, load_tube
-from tubepose.records import ESTIMATE_COLUMNS, POSE_COLUMNS, RACK_COLUMNS, SLOT_COLUMNS, TIMING_COLUMNS
+from tubepose.pose_errors import COVARIANCE_COLUMNS
+from tubepose.records import (
+    ESTIMATE_COLUMNS,
+    POSE_COLUMNS,
+    RACK_COLUMNS,
+    RACK_COVARIANCE_COLUMNS,
+    SLOT_COLUMNS,
+    TIMING_COLUMNS,
+)
 from tubepose.simulation import SceneVariation
 from tubepose.transforms import FloatArray
 from tubepose.uncertainty import COVERAGE_COLUMNS, UNCERTAINTY_COLUMNS
@@ -217,6 +225,8 @@ def documented(name: str) -> set[str]:
     for cell in re.findall(r"^\|(.+?)\|", text, re.MULTILINE):
         if "`tx_m` ... `qz`" in cell:
             told |= set(POSE_COLUMNS)
+        elif "`cov_rx_rx` ... `cov_tz_tz`" in cell:
+            told |= set(RACK_COVARIANCE_COLUMNS if name == "racks" else COVARIANCE_COLUMNS)
         else:
             told |= set(re.findall(r"`([^`]+)`", cell))
     generic = {column for column in told if column.startswith("X_")}

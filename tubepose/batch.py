@@ -36,6 +36,7 @@ class Job:
         session: Name of its session, or empty.
         trial: Name of its trial, or empty.
         T_camera_rack: The rack's pose where it is known and not to be estimated, shape (4, 4), metres; else None.
+        named_by_margin: By how much the rack was ahead of the catalogue's next one; NaN where a person named it.
     """
 
     capture: Capture
@@ -45,6 +46,7 @@ class Job:
     session: str = ""
     trial: str = ""
     T_camera_rack: FloatArray | None = None
+    named_by_margin: float = float("nan")
 
 
 @dataclass(slots=True)
@@ -181,7 +183,9 @@ def _run_frame(
             if method == shown_method and seed in (None, 0):
                 shown = estimates
             if seed in (None, 0):
-                tables.racks.append({**keys, "method": method, **rack_row(scene)})
+                tables.racks.append(
+                    {**keys, "method": method, **rack_row(scene), "named_by_margin": job.named_by_margin}
+                )
                 tables.slots += slot_rows(keys, method, scene, estimates)
     timings = tables.timings if warm_timings is None else warm_timings
     timings += [timing_row(keys, entry, warm_timings is not None) for entry in times]

@@ -6,7 +6,7 @@ frame (origin at the tube's bottom, z along the tube, x turned to the rack's x) 
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,9 +16,16 @@ from tubepose.transforms import FloatArray
 
 MM_PER_M = 1e3
 UPSIDE_DOWN_DEG = 90.0
+
+
+def upper_half(axes: Sequence[str]) -> tuple[str, ...]:
+    """Names of the columns that hold the upper half of a covariance, row by row."""
+    return tuple(f"cov_{a}_{b}" for i, a in enumerate(axes) for b in axes[i:])
+
+
 COVARIANCE_AXES = ("rx", "ry", "tx", "ty", "tz")
 """Order of a pose's covariance: small turns about the tube's x and y, shifts along its x, y and z, at its bottom."""
-COVARIANCE_COLUMNS = tuple(f"cov_{a}_{b}" for i, a in enumerate(COVARIANCE_AXES) for b in COVARIANCE_AXES[i:])
+COVARIANCE_COLUMNS = upper_half(COVARIANCE_AXES)
 """Its upper half, row by row, as columns of result files."""
 _ANGLES = 72
 _SPIN_STEPS = 33

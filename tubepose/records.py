@@ -9,15 +9,19 @@ import numpy as np
 import pandas as pd
 
 from tubepose.pipeline import Scene, StageTime, TubeEstimate
-from tubepose.pose_errors import COVARIANCE_AXES, COVARIANCE_COLUMNS
+from tubepose.pose_errors import COVARIANCE_COLUMNS, upper_half
 from tubepose.transforms import FloatArray, quaternion_wxyz, tilt_rad
 
 Row = dict[str, Any]
+
 POSE_COLUMNS = ("tx_m", "ty_m", "tz_m", "qw", "qx", "qy", "qz")
+RACK_COVARIANCE_AXES = ("rx", "ry", "rz", "tx", "ty", "tz")
+"""Order of a rack's covariance: small turns about its axes and shifts along them, at the centre of its top."""
+RACK_COVARIANCE_COLUMNS = upper_half(RACK_COVARIANCE_AXES)
 RACK_COLUMNS = (
     "session", "trial", "capture", "frame", "timestamp_ns", "method", "rack", "status", "reason", "ambiguous",
     "resolved_by", "turn_margin_m", "inlier_rmse_m", "fitness", "in_slot_share", "coverage", "spacing_m",
-    "n_tubes_detected", *POSE_COLUMNS,
+    "n_tubes_detected", *POSE_COLUMNS, "named_by_margin", *RACK_COVARIANCE_COLUMNS,
 )  # fmt: skip
 SLOT_COLUMNS = (
     "session",
@@ -83,6 +87,7 @@ def rack_row(scene: Scene) -> Row:
         "spacing_m": pose.spacing_m,
         "n_tubes_detected": sum(not detection.is_rack for detection in scene.detections),
         **pose_columns(pose.T_camera_rack),
+        **covariance_columns(pose.covariance, RACK_COVARIANCE_COLUMNS),
     }
 
 
@@ -134,12 +139,12 @@ def estimate_row(keys: Row, scene: Scene, estimate: TubeEstimate) -> Row:
     }
 
 
-def covariance_columns(covariance: FloatArray | None) -> Row:
-    """The upper half of a pose's covariance (5, 5) as columns, rad and metres; NaN without one."""
+def covariance_columns(covariance: FloatArray | None, columns: Sequence[str] = COVARIANCE_COLUMNS) -> Row:
+    """The upper half of a covariance (5, 5) of a tube or (6, 6) of a rack as columns, rad and m; NaN without one."""
     if covariance is None:
-        return dict.fromkeys(COVARIANCE_COLUMNS, float("nan"))
-    half = covariance[np.triu_indices(len(COVARIANCE_AXES))]
-    return dict(zip(COVARIANCE_COLUMNS, map(float, half), strict=True))
+        return dict.fromkeys(columns, float("nan"))
+    half = covariance[np.triu_indices(len(covariance))]
+    return dict(zip(columns, map(float, half), strict=True))
 
 
 def timing_row(keys: Row, entry: StageTime, warmup: bool) -> Row:

@@ -126,8 +126,8 @@ class RackModel(Definition):
         outline_mm: Size of the top along x and y.
         height_mm: Height of the top above the base.
         floor_mm: Height of the slot floor above the base, where a tube's bottom stands.
-        floor_tolerance_mm: Standard deviation of the slot floor's height below the top; large for a rack that was found by
-            its slots alone.
+        floor_tolerance_mm: Standard deviation of the slot floor's height below the top; large for a rack that was found
+            by its slots alone.
         floor_play_mm: How far a tube's bottom centre may stand off the slot's centre (a dent in the floor keeps it).
         slots: The slots, each with its own centre, shape and size; or
         grid: the shorthand for them. Exactly one of the two.
