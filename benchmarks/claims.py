@@ -3,8 +3,8 @@
     tubepose bench data/test --out RUN --seeds 1 --methods upright,profile,paper,slot-icp,global-icp,gicp,kiss-matcher
     python -m benchmarks.claims data/test RUN [--out CLAIMS]
 
-The run's estimates are judged twice: by the truth that printed caps gave (ground_truth.csv of the run), and by the exact
-poses of the simulation. Nothing is estimated again.
+The run's estimates are judged twice: by the truth that printed caps gave (ground_truth.csv of the run), and by the
+exact poses of the simulation. Nothing is estimated again.
 """
 
 from __future__ import annotations

@@ -75,8 +75,8 @@ class RackConfig(_Section):
 
     Attributes:
         method: ``edges``: plane and edges of the top's ribs, openings and outline; ``obb-icp``: the paper's way,
-            oriented bounding box and ICP. The fields from template_spacing_m to coarse_points, min_fitness and min_coverage are
-            the latter's alone.
+            oriented bounding box and ICP. The fields from template_spacing_m to coarse_points, min_fitness and
+            min_coverage are the latter's alone.
         template_spacing_m: Grid of the template of the top surface.
         icp_distances_m: Correspondence distance of each ICP round, coarse to fine.
         icp_iterations: Iterations per round.
@@ -93,7 +93,8 @@ class RackConfig(_Section):
             rack of another pitch 12 % or more.
         max_outside_share: Largest share of the top's points just outside the outline (right rack: 0.1 %).
         max_stretch: How much farther apart, or nearer, than defined slots may lie, beyond three standard deviations;
-            twice as much where less than clear_seen is seen (right rack: 0.9 and 2.3 %; 17.7 and 18 mm differ by 1.7 %).
+            twice as much where less than clear_seen is seen (right rack: 0.9 and 2.3 %; 17.7 and 18 mm differ by
+            1.7 %).
         min_rims: Smallest share of the points expected near edges of openings: with fewer, the openings are wider.
         max_through_share: Largest share of what is seen in place of ribs that lies below them (right rack: 3 %).
         min_seen: Smallest share of the template that is seen: a rack full of caps shows 17 %.
