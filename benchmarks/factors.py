@@ -3,7 +3,8 @@
     python -m benchmarks.factors make [--threads N]           # data/factors/NAME; a run that was stopped goes on
     python -m benchmarks.factors report [--methods ...] [--out FOLDER]    # Markdown on stdout, rows as CSV
 
-benchmarks/factors.yaml says which; the truth is exact. Nothing is chosen with these sessions.
+benchmarks/factors.yaml says which; the truth is exact. Nothing is chosen with these sessions. With --known-rack the
+rack's pose is the exact one, which tells its error, and racks that are not found, from the tubes'.
 """
 
 from __future__ import annotations
@@ -20,20 +21,22 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from benchmarks.dataset import RECIPE, ROOT, read_recipe
 from tubepose.batch import run_jobs, session_jobs
+from tubepose.capture.frame import RgbdFrame
 from tubepose.capture.manifest import Split
 from tubepose.capture.session import Session, is_session, load_session
 from tubepose.config import Config
+from tubepose.detection import Detection
 from tubepose.detection.geometric import GeometricDetector
 from tubepose.errors import ConfigError, TubePoseError
 from tubepose.evaluation import evaluate, summarise
 from tubepose.labware import load_cap, load_rack, load_tube
 from tubepose.labware.reading import read_yaml, validate
-from tubepose.pipeline import METHODS
+from tubepose.pipeline import METHODS, TUBE_METHODS
 from tubepose.provenance import pinned_threads
 from tubepose.records import ESTIMATE_COLUMNS, to_table
 from tubepose.simulation import simulate_session
 from tubepose.simulation.variation import SceneVariation, scene_variation
-from tubepose.truth_tables import TRUTH_COLUMNS, exact_truth_rows
+from tubepose.truth_tables import TRUTH_COLUMNS, exact_truth_rows, with_exact_rack
 from tubepose.uncertainty import uncertainty
 from tubepose_cli.show import counted_progress
 
@@ -116,10 +119,26 @@ def make(plan: Plan, place: Path, threads: int, recipe: Path = RECIPE) -> None:
         print(f"{name}: done", file=sys.stderr, flush=True)
 
 
-def judge(session: Session, methods: Sequence[str], config: Config) -> tuple[pd.DataFrame, str]:
+class NoBoxes:
+    """A detector for methods that need none, where the rack's pose is known as well."""
+
+    name = "recorded"
+
+    def detect(self, frame: RgbdFrame) -> tuple[Detection, ...]:  # noqa: ARG002
+        """No boxes."""
+        return ()
+
+
+def judge(
+    session: Session, methods: Sequence[str], config: Config, *, known_rack: bool = False
+) -> tuple[pd.DataFrame, str]:
     """Rows of errors.csv of a session by its exact truth, and how many racks of how many were accepted."""
     jobs, problems = session_jobs(session)
-    tables = run_jobs(jobs, methods, lambda rack, tubes: GeometricDetector(rack, tubes, config), config)
+    jobs = with_exact_rack(jobs, session) if known_rack else jobs
+    boxes = not known_rack or any(method in TUBE_METHODS for method in methods)
+    tables = run_jobs(
+        jobs, methods, lambda rack, tubes: GeometricDetector(rack, tubes, config) if boxes else NoBoxes(), config
+    )
     for problem in (*problems, *tables.problems):
         print(f"error: {problem}", file=sys.stderr)
     models = {tube.name: tube for tube in session.tubes.values()}
@@ -160,7 +179,7 @@ def over_targets(row: dict[str, float], is_open: bool) -> list[str]:
     return [word for word, (name, limit) in limits.items() if not row[name] <= SLACK * limit]
 
 
-def report(plan: Plan, place: Path, methods: Sequence[str], out: Path) -> str:
+def report(plan: Plan, place: Path, methods: Sequence[str], out: Path, *, known_rack: bool = False) -> str:
     """Judge all sessions; write factors.csv and errors.csv into a folder.
 
     Returns:
@@ -178,7 +197,7 @@ def report(plan: Plan, place: Path, methods: Sequence[str], out: Path) -> str:
     for name in plan.factors:
         session = load_session(place / name)
         with pinned_threads(1):
-            errors, racks = judge(session, methods, Config())
+            errors, racks = judge(session, methods, Config(), known_rack=known_rack)
         is_open = {tube.name: tube.is_open for tube in session.tubes.values()}
         rows += [{"factor": name, "racks": racks, **row} for row in table_rows(errors, is_open)]
         all_errors.append(errors.assign(factor=name))
@@ -218,6 +237,7 @@ def parser() -> argparse.ArgumentParser:
     commands.add_parser("make").add_argument("--threads", type=int, default=1)
     judged = commands.add_parser("report")
     judged.add_argument("--methods", default=",".join(SHOWN), help="with commas")
+    judged.add_argument("--known-rack", action="store_true", help="take the rack's pose from the exact truth")
     judged.add_argument("--out", type=Path, default=Path("out/factors"), help="folder of factors.csv and errors.csv")
     return whole
 
@@ -230,7 +250,8 @@ def main(arguments: list[str] | None = None) -> int:
         if options.command == "make":
             make(plan, options.place, options.threads, options.recipe)
         else:
-            print(report(plan, options.place, options.methods.split(","), options.out))
+            methods = options.methods.split(",")
+            print(report(plan, options.place, methods, options.out, known_rack=options.known_rack))
     except (TubePoseError, OSError) as problem:
         print(f"error: {problem}", file=sys.stderr)
         return 1

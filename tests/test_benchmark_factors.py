@@ -114,6 +114,17 @@ def test_the_table_is_written_and_printed(run, capsys: pytest.CaptureFixture[str
     assert (errors.groupby(["factor", "method"]).size() == 3).all()
 
 
+def test_a_known_rack_needs_no_boxes(run, factors: ModuleType, monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(*arguments):
+        raise AssertionError("boxes are not needed")
+
+    monkeypatch.setattr(factors, "GeometricDetector", refuse)
+    assert run("report", "--known-rack", "--methods", "profile", "--out", str(run.root / "known")) == 0
+    table = pd.read_csv(run.root / "known" / "factors.csv")
+    assert (table[["ok", "expected"]] == 3).all(axis=None)
+    assert (table["racks"] == "1/1").all()
+
+
 def test_wrong_and_beyond_targets_are_counted(factors: ModuleType) -> None:
     values = dict.fromkeys(("rx_deg", "ry_deg", "tx_mm", "ty_mm", "tz_mm"), 0.1) | {"tilt_deg": 0.2}
     rows = [
