@@ -58,7 +58,7 @@ ALLOWED: dict[str, set[str]] = {
     "rack": {"capture", "config", "labware", "preprocessing", "rack_acceptance", "rack_edges", "rack_obb", "rack_pose"},
     "slots": {"config", "labware", "preprocessing", "detection", "rack"},
     "tube": {"config", "labware", "preprocessing", "slots"},
-    "profile": {"capture", "config", "labware", "tube"},
+    "profile": {"capture", "config", "labware", "preprocessing", "tube"},
     "baselines": {"config", "labware", "preprocessing", "slots", "tube"},
     "rivals": {"config", "labware", "tube", "baselines"},
     "pipeline": {

@@ -11,9 +11,12 @@ from numpy.typing import NDArray
 from tubepose.capture.frame import CameraIntrinsics, RgbdFrame
 from tubepose.config import Config, ProfileConfig
 from tubepose.labware import RackModel, TubeModel
+from tubepose.preprocessing import TALLEST_TUBE_M
+from tubepose.profile.floor import SETTLED_MM, settle_floor
 from tubepose.profile.leftovers import Leftover, find_leftovers
 from tubepose.profile.measure import Measured, measure_tops
 from tubepose.profile.posterior import FEW_SAMPLES, Evidence, Posterior, combine, evidence, per_model, pivot_m
+from tubepose.profile.standing import Standing, gather_standing
 from tubepose.profile.verdict import rejection, score
 from tubepose.profile.wall import wall_evidence
 from tubepose.transforms import FloatArray, axis_rotation, make_transform
@@ -67,6 +70,8 @@ def fit_profiles(
     """
     if not tubes:
         return ()
+    if rack.floor_tolerance_mm > SETTLED_MM:
+        rack = settle_floor(_all_standing(frame, intrinsics, T_camera_rack, rack, config), rack, tubes, config.profile)
     measured = measure_tops(frame, intrinsics, T_camera_rack, rack, tubes, config, allowed)
     models = [tubes[k] for k in measured.tops.tube]
     leftovers = find_leftovers(measured.points, measured.label, measured.tops.slot.tolist(), rack, tubes)
@@ -86,6 +91,14 @@ def fit_profiles(
             pose = _rejected(pose, f"two tubes in one slot: {crowd}")
         found.append(ProfileTube(slot.name, tube, float(measured.tops.support[i]), points_m, pose))
     return (*found, *(_no_tube(left, measured, rack) for left in leftovers))
+
+
+def _all_standing(
+    frame: RgbdFrame, intrinsics: CameraIntrinsics | None, T_camera_rack: FloatArray, rack: RackModel, config: Config
+) -> Standing:
+    """All points above a rack whose floor, and so the height of its tubes, is not known."""
+    lowest_m = rack.height_m + config.slots.clearance_m
+    return gather_standing(frame, intrinsics, T_camera_rack, rack, lowest_m, lowest_m + TALLEST_TUBE_M)
 
 
 def fuse(measured: Measured, models: Sequence[TubeModel], rack: RackModel, config: ProfileConfig) -> Posterior:

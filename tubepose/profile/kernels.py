@@ -112,3 +112,34 @@ def sector_counts(label, offset_m, shift_m, lower_m, low_m, high_m, sectors):
             else:
                 edge[t, sector] += 1
     return core, edge
+
+
+@njit(cache=True)
+def radial_brightness(
+    picture, camera, rotation, translation_m, centers_m, levels_m, radii_m, steps_m, sectors, per_sector
+):
+    """Mean brightness (T, sectors, B) of a picture (H, W) around level circles, at their radius plus every step.
+
+    `camera` is (fx, fy, cx, cy). The picture is read between its pixels, where points of the circle's level are seen;
+    outside of it those of its border count.
+    """
+    height, width = picture.shape
+    values = np.zeros((len(centers_m), sectors, len(steps_m)))
+    for t in range(len(centers_m)):
+        for a in range(sectors * per_sector):
+            angle = (a + 0.5) / (sectors * per_sector) * 2.0 * math.pi - math.pi
+            cos, sin = math.cos(angle), math.sin(angle)
+            for b in range(len(steps_m)):
+                r = radii_m[t] + steps_m[b]
+                x, y, z = centers_m[t, 0] + r * cos, centers_m[t, 1] + r * sin, levels_m[t]
+                depth = rotation[2, 0] * x + rotation[2, 1] * y + rotation[2, 2] * z + translation_m[2]
+                right = rotation[0, 0] * x + rotation[0, 1] * y + rotation[0, 2] * z + translation_m[0]
+                down = rotation[1, 0] * x + rotation[1, 1] * y + rotation[1, 2] * z + translation_m[1]
+                u = min(max(camera[0] * right / depth + camera[2], 0.0), width - 1.001)
+                v = min(max(camera[1] * down / depth + camera[3], 0.0), height - 1.001)
+                i, j = int(v), int(u)
+                dv, du = v - i, u - j
+                upper = picture[i, j] * (1.0 - du) + picture[i, j + 1] * du
+                lower = picture[i + 1, j] * (1.0 - du) + picture[i + 1, j + 1] * du
+                values[t, a // per_sector, b] += (upper * (1.0 - dv) + lower * dv) / per_sector
+    return values

@@ -76,14 +76,8 @@ def measure_tops(
         allowed: Which type may stand in which slot, shape (K, S); all by default.
     """
     tallest = max(tube.height_m for tube in tubes)
-    standing = gather_standing(
-        frame,
-        intrinsics,
-        T_camera_rack,
-        rack,
-        rack.height_m + config.slots.clearance_m,
-        rack.floor_m + tallest + TALLER_M,
-    )
+    lowest_m, highest_m = rack.height_m + config.slots.clearance_m, rack.floor_m + tallest + TALLER_M
+    standing = gather_standing(frame, intrinsics, T_camera_rack, rack, lowest_m, highest_m)
     tops = find_tops(standing, rack, tubes, config.profile, allowed)
     shape = _shapes(tops, tubes, rack)
     rims = _measure_rims(frame, intrinsics, T_camera_rack, tops, shape, config.profile)

@@ -7,8 +7,9 @@ from numpy.typing import NDArray
 
 from tubepose.capture.frame import CameraIntrinsics, RgbdFrame
 from tubepose.config import ProfileConfig
+from tubepose.profile.kernels import radial_brightness
 from tubepose.profile.outline import NORMALS, SECTORS, Circles, fit_circles
-from tubepose.transforms import FloatArray, transform_points
+from tubepose.transforms import FloatArray
 
 BIN_M = 0.25e-3
 WIDE_M = 1.75e-3
@@ -16,6 +17,8 @@ WIDE_M = 1.75e-3
 SEARCH_M = 0.9e-3
 """How far off its expected radius a sector of the ring is looked for."""
 ROUNDS = 2
+PER_SECTOR = 3
+"""Radii along which a sector of the image is read."""
 MIN_CONTRAST = 0.35
 """Correlation of a sector's brightness with a ring's, below which the sector does not count."""
 
@@ -63,16 +66,15 @@ def fit_rims(
     return Circles(offset, circles.covariance_m2, circles.widening_m, circles.sectors)
 
 
-def brightness(frame: RgbdFrame) -> NDArray[np.float32]:
+def brightness(frame: RgbdFrame) -> NDArray[np.float32] | NDArray[np.uint8]:
     """Gray values of a frame, shape (H, W); 1 and 0 for pixels with and without depth where it has no image."""
     if frame.image is None:
         return np.isfinite(frame.cloud_m[..., 2]).astype(np.float32)
-    image = frame.image.astype(np.float32)
-    return image if image.ndim == 2 else image.mean(axis=2)
+    return frame.image if frame.image.ndim == 2 else frame.image.mean(axis=2, dtype=np.float32)
 
 
 def _radial_profiles(
-    picture: NDArray[np.float32],
+    picture: NDArray[np.float32] | NDArray[np.uint8],
     intrinsics: CameraIntrinsics,
     T_camera_rack: FloatArray,
     center_m: FloatArray,
@@ -88,27 +90,10 @@ def _radial_profiles(
     # The ring's own width on both sides of it is its background.
     reach = search_m + float(np.ptp(radii_m, axis=1).max()) + BIN_M
     steps = np.arange(-reach, reach + BIN_M / 2, BIN_M)
-    angle = (np.arange(3 * SECTORS) + 0.5) / (3 * SECTORS) * 2 * np.pi - np.pi
-    r = middle[:, None, None] + steps
-    x = center_m[:, 0, None, None] + r * np.cos(angle)[None, :, None]
-    y = center_m[:, 1, None, None] + r * np.sin(angle)[None, :, None]
-    z = np.broadcast_to(level_m[:, None, None], x.shape)
-    uv = intrinsics.project(transform_points(T_camera_rack, np.stack([x, y, z], axis=-1)))
-    values = _bilinear(picture, uv[..., 0], uv[..., 1])
-    return values.reshape(len(center_m), SECTORS, 3, len(steps)).mean(axis=2), steps
-
-
-def _bilinear(picture: NDArray[np.float32], u: FloatArray, v: FloatArray) -> FloatArray:
-    """Values between pixels; outside of the picture those of its border."""
-    height, width = picture.shape
-    u, v = np.clip(u, 0, width - 1.001), np.clip(v, 0, height - 1.001)
-    left, top = u.astype(np.intp), v.astype(np.intp)
-    du, dv = u - left, v - top
-    flat = picture.reshape(-1)
-    at = top * width + left
-    upper = flat[at] * (1 - du) + flat[at + 1] * du
-    lower = flat[at + width] * (1 - du) + flat[at + width + 1] * du
-    return np.asarray(upper * (1 - dv) + lower * dv)
+    camera = np.array([intrinsics.fx, intrinsics.fy, intrinsics.cx, intrinsics.cy])
+    R, t = np.ascontiguousarray(T_camera_rack[:3, :3]), np.ascontiguousarray(T_camera_rack[:3, 3])
+    values = radial_brightness(picture, camera, R, t, center_m, level_m, middle, steps, SECTORS, PER_SECTOR)
+    return np.asarray(values), steps
 
 
 def _ring_scores(
