@@ -350,3 +350,21 @@ def test_a_rack_that_is_not_in_the_image_has_no_tubes(frame):
     T_beside = VIEW.copy()
     T_beside[0, 3] += 3.0
     assert ps.fit(frame, T_beside, RACK, TUBES) == ()
+
+
+# A floor that is not known
+
+
+@pytest.mark.parametrize("off_mm", [-7.0, 0.0, 11.0])
+def test_a_floor_that_is_not_known_is_found_from_the_tops(frame, found, off_mm):
+    unsure = RACK.model_copy(update={"floor_mm": RACK.floor_mm + off_mm, "floor_tolerance_mm": 50.0})
+    tubes, known = ps.by_slot(ps.fit(frame, VIEW, unsure, TUBES)), ps.by_slot(found)
+    assert {slot: entry.tube for slot, entry in tubes.items()} == {slot: entry.tube for slot, entry in known.items()}
+    for slot, (tube, _) in CLOSED.items():
+        moved = tubes[slot].pose.T_rack_tube - known[slot].pose.T_rack_tube
+        assert np.abs(moved[:3, 3]).max() < 0.6e-3, (slot, tube.name)
+
+
+def test_a_floor_that_is_known_is_not_moved(frame):
+    off = RACK.model_copy(update={"floor_mm": RACK.floor_mm + 7.0})
+    assert all(entry.pose.status is TubeStatus.REJECTED for entry in ps.fit(frame, VIEW, off, TUBES))
