@@ -213,7 +213,7 @@ def markdown(table: pd.DataFrame) -> Iterator[str]:
     """Lines of the table, one per tube, factor and method."""
     yield (
         "| tube | factor | method | R_x, R_y (deg) | tilt mean, p95 (deg) | T_x, T_y, T_z (mm) | ok/expected | "
-        "rejected/missed/failed | wrong | false | inside 95 % | within twice the targets |"
+        "rejected/missed/failed | wrong | false | inside 95 % | answers within twice the targets |"
     )
     yield "|---|---|---|--:|--:|--:|--:|--:|--:|--:|--:|---|"
     for row in table.to_dict("records"):
@@ -223,7 +223,8 @@ def markdown(table: pd.DataFrame) -> Iterator[str]:
         cells += [f"{row['ok']}/{row['expected']}", f"{row['rejected']}/{row['missed']}/{row['failed']}"]
         cells += [str(row["wrong"]), str(row["false"])]
         cells.append("-" if np.isnan(row["inside_95"]) else f"{row['inside_95']:.3f}")
-        cells.append(f"no: {row['over']}" if row["over"] else "yes")
+        within = f"no: {row['over']}" if row["over"] else "yes"
+        cells.append(within if row["ok"] else "no answer")
         yield "| " + " | ".join(cells) + " |"
 
 
