@@ -19,12 +19,16 @@ from tubepose.rack_field import top_field
 from tubepose.rack_fit import Fit, refine
 from tubepose.rack_pose import MIN_POINTS, RackPose, RackStatus, choose_turn
 from tubepose.rack_search import Band, levels, search
-from tubepose.transforms import HALF_TURN, FloatArray, make_transform
+from tubepose.transforms import HALF_TURN, FloatArray, invert_transform, make_transform, transform_points
 
 # A rack full of caps shows its lattice better than its ends: so many slots may the search be off.
 SLOT_STEPS = 6
 # Places whose coarse picture agrees less than this, compared with one that was accepted, are no rivals of it.
 RIVAL_WORTH = 0.4
+
+
+# Beside a coarse place: its own error, and what lies outside of a top.
+NEAR_M = 0.06
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -140,16 +144,34 @@ def coarse_sample(points_m: FloatArray, config: RackTopConfig) -> FloatArray:
     return thin(points_m, min(max(config.coarse_points, len(points_m) // 3), config.search_points))
 
 
+def seen_near(points_m: FloatArray, T_camera_rack: FloatArray, rack: RackModel) -> FloatArray:
+    """Points whose lines of sight cross the level of a top at its outline or near it.
+
+    Samples are drawn from the points that are given: of a whole frame with a bright table few would be of the rack.
+    """
+    top = make_transform(np.eye(3), np.array([0.0, 0.0, rack.height_m]))
+    T_top_camera = invert_transform(T_camera_rack @ top)
+    local = transform_points(T_top_camera, points_m)
+    camera = T_top_camera[:3, 3]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        along = camera[2] / (camera[2] - local[:, 2])
+    at = camera[:2] + along[:, None] * (local[:, :2] - camera[:2])
+    near = np.all(np.abs(at) < rack.outline_m / 2 + NEAR_M, axis=1)
+    return points_m[near] if np.count_nonzero(near) >= MIN_POINTS else points_m
+
+
 def register_at(points_m: FloatArray, T_camera_rack: FloatArray, rack: RackModel, config: RackConfig) -> Registration:
     """Refine a coarse pose and judge it; where one a slot farther has more evidence, go there first."""
-    fit = refine(points_m, T_camera_rack, rack)
-    agreement = measure_agreement(points_m, fit, rack, config)
+    near_m = seen_near(points_m, T_camera_rack, rack)
+    fit = refine(near_m, T_camera_rack, rack)
+    agreement = measure_agreement(near_m, fit, rack, config)
     for _ in range(SLOT_STEPS):
         if agreement.slot_margin >= 0 or agreement.in_slot > 2 * config.max_stray_share:
             break
         T_step = make_transform(np.eye(3), np.array([*agreement.step_m, 0.0]))
-        farther = refine(points_m, fit.T_camera_rack @ T_step, rack)
-        there = measure_agreement(points_m, farther, rack, config)
+        near_m = seen_near(points_m, fit.T_camera_rack @ T_step, rack)
+        farther = refine(near_m, fit.T_camera_rack @ T_step, rack)
+        there = measure_agreement(near_m, farther, rack, config)
         if there.evidence <= agreement.evidence:
             break
         fit, agreement = farther, there
