@@ -14,11 +14,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from tubepose import rack_kernels as kernels
+from tubepose import rack_view_kernels as view_kernels
 from tubepose.config import RackConfig
 from tubepose.labware import RackModel
 from tubepose.rack_field import GRID_M, PICTURE_M, picture, top_field
-from tubepose.rack_fit import EDGE_SHIFT_M, LEAST_POINTS, WRONG_SHARE, Fit, Labels, label, to_frame, top_frame
-from tubepose.rack_search import crossings
+from tubepose.rack_fit import EDGE_SHIFT_M, LEAST_POINTS, WRONG_SHARE, Fit, Labels, camera_place, label, top_frame
 from tubepose.transforms import FloatArray
 
 # Half thickness of the layer that is judged: the standard deviation of heights, but at least that of a good sensor, and
@@ -81,6 +82,7 @@ class Agreement:
 
 def measure_agreement(points_m: FloatArray, fit: Fit, rack: RackModel, config: RackConfig) -> Agreement:
     """Compare points (N, 3), camera frame, with a fit."""
+    points_m = np.ascontiguousarray(points_m, float)
     window_m = float(np.clip(fit.scatter_m, *JUDGED_M))
     seen = label(points_m, fit.T_camera_rack, rack, window_m)
     top = top_field(rack)
@@ -117,23 +119,16 @@ def measure_agreement(points_m: FloatArray, fit: Fit, rack: RackModel, config: R
 
 def _on_ribs(points_m: FloatArray, fit: Fit, rack: RackModel) -> FloatArray:
     """Points near the solid part of the top, frame of the top, shape (N, 3), metres; rough scans have more of them."""
-    local = to_frame(points_m, top_frame(fit.T_camera_rack, rack))
-    local = local[np.abs(local[:, 2]) < SCATTER_M]
-    distance, _, known = top_field(rack).look_up(local[:, :2])
-    return np.asarray(local[known & (distance < 0)])
+    T = top_frame(fit.T_camera_rack, rack)
+    local, distance, _ = kernels.laid(points_m, T[:3, :3], T[:3, 3], SCATTER_M, *top_field(rack).grid)
+    return np.asarray(local[distance < 0])
 
 
 def _unseen(points_m: FloatArray, fit: Fit, rack: RackModel) -> float:
-    cell_m = 4 * PICTURE_M
+    shape = np.ceil(rack.outline_m / (4 * PICTURE_M)).astype(int)
     T = top_frame(fit.T_camera_rack, rack)
-    local = to_frame(points_m[:: len(points_m) // 10_000 + 1], T)
-    camera = -T[:3, 3] @ T[:3, :3]
-    xy = crossings(local, camera)
-    shape = np.ceil(rack.outline_m / cell_m).astype(int)
-    cells = np.floor((xy + rack.outline_m / 2) / rack.outline_m * shape).astype(np.intp)
-    cells = cells[np.all((cells >= 0) & (cells < shape), axis=1)]
-    hit = np.zeros(shape, bool)
-    hit[cells[:, 0], cells[:, 1]] = True
+    step = len(points_m) // 10_000 + 1
+    hit = view_kernels.cells_crossed(points_m, step, T[:3, :3], T[:3, 3], camera_place(T), rack.outline_m, shape)
     return float(1 - hit.mean())
 
 
@@ -141,14 +136,15 @@ def _evidence(seen: Labels, rack: RackModel) -> tuple[float, float, tuple[float,
     """Evidence of the pose, and the most of any pose a slot farther with its step, in nats of all points."""
     solid, free = seen.solid_m[:, :2], seen.free_m
     steps = len(solid) // EVIDENCE_POINTS + 1, len(free) // EVIDENCE_POINTS + 1
-    solid, free = solid[:: steps[0]], free[:: steps[1]]
+    solid, free = solid[:: steps[0]].copy(), free[:: steps[1]].copy()
 
     def at(shift_m: FloatArray) -> float:
         total = 0.0
-        for places, sign, step in ((solid - shift_m, 1, steps[0]), (free - shift_m, -1, steps[1])):
-            distance, _, known = top_field(rack).look_up(places)
-            chance = _chance(sign * (EDGE_SHIFT_M - distance[known]))
-            total += step * float(np.log(chance / _mean_chance(rack, sign)).sum())
+        for places, sign, step in ((solid, 1, steps[0]), (free, -1, steps[1])):
+            logs, count = view_kernels.log_chances(
+                places, shift_m, *top_field(rack).grid, sign, EDGE_SHIFT_M, EVIDENCE_BLUR_M, WRONG_SHARE
+            )
+            total += step * (logs - count * float(np.log(_mean_chance(rack, sign))))
         return total
 
     beside = [(at(shift), (float(shift[0]), float(shift[1]))) for shift in slot_steps_m(rack)]

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import fft
 
+from tubepose import rack_kernels as kernels
 from tubepose.labware import RackModel
 from tubepose.transforms import FloatArray
 
@@ -50,15 +51,13 @@ class TopField:
 
     def look_up(self, xy_m: FloatArray) -> tuple[FloatArray, FloatArray, NDArray[np.bool_]]:
         """Distance (N,), gradient (N, 2) and whether the point lies on the grid (N,), of points (N, 2), rack frame."""
-        x, y = (xy_m[:, 0] - self.low_m[0]) * (1 / GRID_M), (xy_m[:, 1] - self.low_m[1]) * (1 / GRID_M)
-        i, j = np.rint(x), np.rint(y)
-        known = (i >= 0) & (i < self.shape[0]) & (j >= 0) & (j < self.shape[1])
-        flat = (i * self.shape[1] + j).astype(np.intp)
-        if not known.all():
-            flat[~known] = 0
-        found = self.table.take(flat, axis=0)
-        distance = found[:, 0] + GRID_M * ((x - i) * found[:, 1] + (y - j) * found[:, 2])
-        return distance, found[:, 1:], known
+        distance, slope, known = kernels.look_up(xy_m, *self.grid)
+        return distance, slope, known
+
+    @property
+    def grid(self) -> tuple[FloatArray, float, tuple[int, int], Float32]:
+        """What the kernels take: place of the first cell, side of a cell (metres), cells along x and y, the table."""
+        return self.low_m, GRID_M, self.shape, self.table
 
 
 @lru_cache(maxsize=32)

@@ -15,9 +15,10 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from tubepose import rack_kernels as kernels
+from tubepose import rack_view_kernels as view_kernels
 from tubepose.labware import RackModel
 from tubepose.rack_field import TopField, top_field
-from tubepose.rack_search import crossings
 from tubepose.transforms import FloatArray, make_transform
 
 # Per round: blur of the edges (the first as wide as a coarse start may be off, the last half a pixel of 0.4 mm), and
@@ -101,11 +102,10 @@ def refine(points_m: FloatArray, T_camera_rack: FloatArray, rack: RackModel) -> 
     """Refine a coarse pose (2 mm and 1.5 degrees off at most) with points (N, 3), camera frame, metres."""
     field = top_field(rack)
     state = _State(top_frame(T_camera_rack, rack), WIDEST_M, UNKNOWN * np.eye(6))
-    local = to_frame(points_m, state.T_camera_top)
-    reach = rack.outline_m / 2 + 5e-3
-    near = (np.abs(local[:, 2]) < 5e-3) & (np.abs(local[:, 0]) < reach[0]) & (np.abs(local[:, 1]) < reach[1])
-    kept = points_m[near]
-    rough, fine = kept[:: len(kept) // ROUGH_POINTS + 1], kept[:: len(kept) // FINE_POINTS + 1]
+    points_m = np.ascontiguousarray(points_m, float)
+    T, reach_m = state.T_camera_top, rack.outline_m / 2 + 5e-3
+    kept = kernels.near_top(points_m, T[:3, :3], T[:3, 3], reach_m, 5e-3)
+    rough, fine = (kept[:: len(kept) // count + 1].copy() for count in (ROUGH_POINTS, FINE_POINTS))
     for number, (blur_m, widths_m) in enumerate(ROUNDS_M):
         _step(rough if number < ROUGH_ROUNDS else fine, state, field, blur_m, widths_m, number == len(ROUNDS_M) - 1)
         if number == ROUGH_ROUNDS - 1 and state.stray > HOPELESS_SHARE:
@@ -124,40 +124,38 @@ def _step(
     points_m: FloatArray, state: _State, field: TopField, blur_m: float, widths_m: FloatArray, last: bool
 ) -> None:
     """One round of plane and edges, in place; the last one tells their covariance."""
-    local = to_frame(points_m, state.T_camera_top)
+    T = state.T_camera_top
     window_m = max(EDGE_WINDOW_M, min(3 * state.scatter_m, float(widths_m[0])))
-    local = local[np.abs(local[:, 2]) < max(window_m, float(widths_m[0]))]
-    distance, slope, known = field.look_up(local[:, :2])
-    local, distance, slope = local[known], distance[known], slope[known]
+    height_m = max(window_m, float(widths_m[0]))
+    seen = kernels.laid(points_m, T[:3, :3], T[:3, 3], height_m, *field.grid)
+    local, distance, _ = seen
     state.covariance = UNKNOWN * np.eye(6)
     move = np.zeros(6)
     inside = distance < -INSIDE_M
     if inside.sum() >= LEAST_POINTS:
         plane, edges = np.ix_([0, 1, 5], [0, 1, 5]), np.ix_([2, 3, 4], [2, 3, 4])
         move[[0, 1, 5]], state.covariance[plane], state.scatter_m = _plane(local[inside], widths_m, last)
-        near = np.abs(local[:, 2]) < window_m
-        found, state.covariance[edges] = _edges(local[near, :2], distance[near], slope[near], blur_m, last)
-        move[[2, 3, 4]] = found
-        state.stray = float(np.mean(distance[near] > STRAY_M))
+        move[[2, 3, 4]], state.covariance[edges] = _edges(seen, window_m, blur_m, last)
+        state.stray = float(np.mean(distance[np.abs(local[:, 2]) < window_m] > STRAY_M))
     T_step = make_transform(Rotation.from_rotvec(move[:3]).as_matrix(), move[3:])
     state.T_camera_top = state.T_camera_top @ T_step
 
 
 def _stretch(points_m: FloatArray, state: _State, field: TopField) -> tuple[FloatArray, FloatArray]:
     """Stretch along x and y with which the template agrees best, and its standard deviations."""
-    local = to_frame(points_m, state.T_camera_top)
+    T = state.T_camera_top
+    local = to_frame(points_m, T)
     xy = local[np.abs(local[:, 2]) < max(EDGE_WINDOW_M, min(3 * state.scatter_m, WIDEST_M)), :2]
+    places = np.zeros((len(xy), 3))
     moved = np.zeros(5)
     covariance = np.eye(5)
     for number in range(STRETCH_ROUNDS):
         turn = np.array([[1.0, -moved[0]], [moved[0], 1.0]])
-        places = (xy - moved[1:3]) @ turn / (1 + moved[3:])
-        distance, slope, known = field.look_up(places)
-        if known.sum() < LEAST_POINTS:
+        places[:, :2] = (xy - moved[1:3]) @ turn / (1 + moved[3:])
+        seen = kernels.laid(places, np.eye(3), np.zeros(3), np.inf, *field.grid)
+        if len(seen[0]) < LEAST_POINTS:
             return np.zeros(2), np.full(2, np.inf)
-        step, covariance = _edges(
-            places[known], distance[known], slope[known], STRETCH_BLUR_M, number == STRETCH_ROUNDS - 1, True
-        )
+        step, covariance = _edges(seen, np.inf, STRETCH_BLUR_M, number == STRETCH_ROUNDS - 1, True)
         moved = moved + step
     return moved[3:], np.sqrt(np.diag(covariance))[3:]
 
@@ -168,74 +166,34 @@ def _plane(points_m: FloatArray, widths_m: FloatArray, last: bool) -> tuple[Floa
     The heights that count are narrowed step by step, so that the plane ends on the mode and not on the mean: light that
     goes astray sinks or lifts whole stretches of ribs. Places count alike, not points: a wall at the outline has most.
     """
-    x, y, h = points_m.T
-    design = np.column_stack([y, -x, np.ones(len(x))])
-    found = np.array([0.0, 0.0, _mode(h, float(widths_m[0]))])
-    balance = _balance(points_m)
-    scatter = float(widths_m[0])
-    for width in widths_m:
-        off = h - design @ found
-        size = np.abs(off)
-        scatter = float(1.4826 * np.median(size[size < max(width, 2 * scatter)]))
-        weight = balance * np.maximum(1 - (off / max(width, min(2 * scatter, WIDEST_M))) ** 2, 0) ** 2
-        normal = design.T @ (weight[:, None] * design) + np.diag([1e-9, 1e-9, 1e-6])
-        found = found + np.linalg.solve(normal, design.T @ (weight * off))
-    scores = (weight * (h - design @ found))[:, None] * design
-    return found, _clustered(normal, scores, points_m) if last else np.eye(3), scatter
-
-
-def _balance(points_m: FloatArray) -> FloatArray:
-    """Weight of every point that makes all squares of the shared length count alike, those with few points less."""
-    cells = np.rint(points_m[:, :2] / SHARED_LENGTH_M).astype(np.intp)
-    cells -= cells.min(axis=0)
-    index = cells[:, 0] * (cells[:, 1].max() + 1) + cells[:, 1]
-    return np.asarray(1 / np.maximum(np.bincount(index), FULL_SQUARE)[index])
+    balance = 1 / np.maximum(kernels.square_counts(points_m, SHARED_LENGTH_M), FULL_SQUARE)
+    found, scatter_m, normal, scores = kernels.plane_steps(points_m, balance, widths_m, WIDEST_M)
+    return found, _clustered(normal, scores, points_m) if last else np.eye(3), float(scatter_m)
 
 
 def _clustered(normal: FloatArray, scores: FloatArray, points_m: FloatArray) -> FloatArray:
     """Covariance of a fit whose residuals are alike within squares of `CLUSTER_M`, and independent between them."""
     if len(points_m) == 0:
         return UNKNOWN * np.eye(len(normal))
-    cells = np.floor(points_m[:, :2] / CLUSTER_M).astype(np.intp)
-    cells -= cells.min(axis=0)
-    index = cells[:, 0] * (cells[:, 1].max() + 1) + cells[:, 1]
-    sums = np.stack([np.bincount(index, column) for column in scores.T], axis=1)
-    count = int(np.count_nonzero(np.bincount(index)))
+    products, count = kernels.cluster_sums(points_m, scores, CLUSTER_M)
     inverse = np.linalg.inv(normal)
-    return np.asarray(inverse @ (sums.T @ sums) @ inverse * (count / max(count - len(normal), 1)))
-
-
-def _mode(h: FloatArray, window_m: float) -> float:
-    """Height of the densest bin: light that was scattered on its way pulls means, and hardly moves the mode."""
-    bins = np.arange(-window_m, window_m * 1.001, window_m / 20)
-    counts = np.convolve(np.histogram(h, bins)[0], [0.5, 1, 1, 1, 0.5], mode="same")
-    return float(bins[int(counts.argmax())] + window_m / 40)
+    return np.asarray(inverse @ products @ inverse * (count / max(count - len(normal), 1)))
 
 
 def _edges(
-    xy_m: FloatArray, distance_m: FloatArray, slope: FloatArray, blur_m: float, last: bool, stretch: bool = False
+    seen: tuple[FloatArray, FloatArray, FloatArray], window_m: float, blur_m: float, last: bool, stretch: bool = False
 ) -> tuple[FloatArray, FloatArray]:
     """Yaw, shift along x and y, and stretch along them if asked for, that put points on the solid part.
 
-    One step of Fisher scoring, and the covariance of where the steps end.
+    Of those whose heights are within the window: their places (N, 3), distances (N,) and gradients (N, 2).
+    One step of Fisher scoring, and the covariance of where steps end.
     """
-    eta = (EDGE_SHIFT_M - distance_m) / blur_m
-    near = np.abs(eta) < 6
-    eta, g, xy = eta[near], slope[near], xy_m[near]
-    plain = 1 / (1 + np.exp(-eta))
-    chance = WRONG_SHARE + (1 - 2 * WRONG_SHARE) * plain
-    rate = (1 - 2 * WRONG_SHARE) * plain * (1 - plain)
-    # Moving the rack by t moves a point by -t in its frame.
-    columns = [g[:, 1] * xy[:, 0] - g[:, 0] * xy[:, 1], g[:, 0], g[:, 1]]
-    if stretch:
-        columns += [g[:, 0] * xy[:, 0], g[:, 1] * xy[:, 1]]
-    design = np.column_stack(columns) / blur_m
-    information = design.T @ ((rate**2 / (chance * (1 - chance)))[:, None] * design)
-    information += np.diag([1e1, 1e5, 1e5, 1e1, 1e1][: len(columns)])
-    scores = (rate / chance)[:, None] * design
+    count = 5 if stretch else 3
+    information, scores, xy = kernels.edge_step(*seen, window_m, EDGE_SHIFT_M, blur_m, WRONG_SHARE, count)
+    information += np.diag([1e1, 1e5, 1e5, 1e1, 1e1][:count])
     step = np.linalg.solve(information, scores.sum(axis=0))
     step *= min(1.0, 1e-3 / max(float(np.abs(step[1:3]).max()), 1e-12))
-    return step, _clustered(information, scores, xy) if last else np.eye(len(columns))
+    return step, _clustered(information, scores, xy) if last else np.eye(count)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -256,10 +214,12 @@ def label(points_m: FloatArray, T_camera_rack: FloatArray, rack: RackModel, wind
 
     Left out are points far beside it, and those whose height is neither within `window_m` of the top nor far below.
     """
-    T_camera_top = top_frame(T_camera_rack, rack)
-    local = to_frame(points_m, T_camera_top)
-    camera = -T_camera_top[:3, 3] @ T_camera_top[:3, :3]
-    solid = local[np.abs(local[:, 2]) < window_m]
-    free = crossings(local[local[:, 2] < -max(THROUGH_M, 2 * window_m)], camera)
-    reach = rack.outline_m / 2 + BESIDE_M
-    return Labels(*(p[(np.abs(p[:, 0]) < reach[0]) & (np.abs(p[:, 1]) < reach[1])] for p in (solid, free)))
+    T = top_frame(T_camera_rack, rack)
+    points_m = np.ascontiguousarray(points_m, float)
+    reach_m, through_m = rack.outline_m / 2 + BESIDE_M, max(THROUGH_M, 2 * window_m)
+    return Labels(*view_kernels.labelled(points_m, T[:3, :3], T[:3, 3], camera_place(T), reach_m, window_m, through_m))
+
+
+def camera_place(T_camera_frame: FloatArray) -> FloatArray:
+    """Where the camera stands in a frame, shape (3,), metres."""
+    return np.asarray(-T_camera_frame[:3, 3] @ T_camera_frame[:3, :3])
