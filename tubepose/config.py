@@ -219,8 +219,8 @@ class ProfileConfig(_Section):
     min_top_points: int = 30
     shared_error_m: float = 2.0e-5
     shared_error_reach_m: float = 3.0e-3
-    outline_noise_m: float = 1.2e-4
-    outline_bias_m: float = 1.1e-4
+    outline_noise_m: float = 1.7e-4
+    outline_bias_m: float = 9.0e-5
     widening_m: float = 3.0e-4
     rim_noise_m: float = 2.0e-4
     rim_bias_m: float = 5.0e-5

@@ -26,6 +26,8 @@ DENSITY_BAND_M = 1.0e-3
 COARSE_BAND_M = 2.5e-3
 MIN_CORE_POINTS = 6.0
 """A coarse scan has no more points than this of a sector in that ring: it gets a wider one, and less trust."""
+MAX_STD_M = 1.0e-3
+"""A circle that is not known better than this is not known."""
 OUTLINE_DEPTH_M = WIDTHS_M[0][0] + COARSE_BAND_M
 """Points farther inside of a circle than this do not count, the start's own error included."""
 
@@ -151,14 +153,15 @@ def fit_circles(
     """Offset and widening of circles from the excess radius of their sectors, shape (T, SECTORS), metres.
 
     A projector at one side blurs a circle's ends less along the baseline than across it, which looks like an ellipse:
-    two more unknowns with a prior. Weights are Huber's. The noise `sigma_m` is one for all circles or one each, (T,).
+    two more unknowns with a prior. Weights are Huber's. The noise `sigma_m` is one for all circles or one each, (T,);
+    where the sectors scatter more, the circle is known so much worse: they are then seldom independent.
     """
     sigma = np.broadcast_to(np.asarray(sigma_m), len(excess_m))[:, None]
     design = np.column_stack([NORMALS, np.ones(SECTORS), np.cos(2 * ANGLES), np.sin(2 * ANGLES)])
     prior = np.diag([0.0, 0.0, 1 / config.widening_m**2, 1 / config.widening_m**2, 1 / config.widening_m**2])
     value = np.where(seen, excess_m, 0.0)
     weight = seen / sigma**2
-    solution = np.zeros((len(excess_m), 5))
+    solution, residual = np.zeros((len(excess_m), 5)), np.zeros(excess_m.shape)
     normal = np.tile(np.eye(5), (len(excess_m), 1, 1))
     usable = seen.sum(axis=1) >= SECTORS // 4
     for _ in range(6):
@@ -168,11 +171,13 @@ def fit_circles(
         solution = np.linalg.solve(normal, right[..., None])[..., 0]
         residual = np.abs(value - solution @ design.T)
         weight = seen / sigma**2 * np.minimum(1.0, 1.5 * sigma / np.maximum(residual, 1e-9))
-    covariance = np.linalg.inv(normal)[:, :2, :2]
-    usable &= np.trace(covariance, axis1=1, axis2=2) < (0.5e-3) ** 2
+    scatter = ((seen * residual**2).sum(axis=1) / np.maximum(seen.sum(axis=1) - 3, 1))[:, None, None]
+    covariance = np.linalg.inv(normal)[:, :2, :2] + np.eye(2) * bias_m**2
+    covariance *= np.maximum(scatter / sigma[..., None] ** 2, 1.0)
+    usable &= np.trace(covariance, axis1=1, axis2=2) < MAX_STD_M**2
     return Circles(
         np.where(usable[:, None], solution[:, :2], np.nan),
-        covariance + np.eye(2) * bias_m**2,
+        covariance,
         solution[:, 2],
         (seen.sum(axis=1) / SECTORS),
     )
