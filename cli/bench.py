@@ -124,7 +124,7 @@ def _report(
     slots = slot_accuracy(to_table(tables.slots, SLOT_COLUMNS), measured.truth)
     write_csv(out / "slot_accuracy.csv", slots)
     notes = [_data_note(measured, jobs), *measured.notes, *_rack_notes(tables), *_slot_notes(slots)]
-    notes += [*_uncertainty_notes(errors), *_confusion_notes(errors)]
+    notes += [*_uncertainty_notes(errors, measured), *_confusion_notes(errors)]
     notes += _rival_notes(methods, config, seeds)
     if any(method in STOCHASTIC for method in methods):
         notes += _spread_notes(seed_spread(errors))
@@ -174,12 +174,15 @@ def _confusion_notes(errors: pd.DataFrame) -> list[str]:
     return [f"Types taken for others: {told}."] if told else []
 
 
-def _uncertainty_notes(errors: pd.DataFrame) -> list[str]:
+def _uncertainty_notes(errors: pd.DataFrame, measured: MeasuredTruth) -> list[str]:
+    """How honest stated errors are; a measured truth has an error of its own, which no estimator can state."""
     from tubepose.uncertainty import ALL_TUBES, uncertainty
+    from tubepose_cli.truth import EXACT_NOTE
 
     rows = [row for row in uncertainty(errors).to_dict("records") if row["tube"] == ALL_TUBES]
+    own = "" if EXACT_NOTE in measured.notes else " (the truth's own error is not in that)"
     return [
-        f"{row['method']}: {row['inside_95']:.1%} of {row['n']} truths inside the stated 95 % region; mean tilt error "
+        f"{row['method']}: {row['inside_95']:.1%} of {row['n']} truths inside the stated 95 % region{own}; mean tilt error "
         f"{row['tilt_deg_all']:.2f} deg of all, {row['tilt_deg_best_half']:.2f} of the half with the higher scores."
         for row in rows
     ]
