@@ -33,6 +33,9 @@ SCATTER_M = 2.5e-3
 BORDER_M = 3.5e-3
 # Blur of an edge in what counts as evidence: it must forgive a pixel.
 EVIDENCE_BLUR_M = 0.4e-3
+# Distances that its likelihood is tabled over: beyond them it is what wrong pixels leave.
+CHANCE_STEP_M = 5e-6
+CHANCE_STEPS = 1600
 # Points that evidence is counted on where it is counted several times.
 EVIDENCE_POINTS = 3000
 # Points nearer than this share their label's error: they count as one.
@@ -139,13 +142,13 @@ def _evidence(seen: Labels, rack: RackModel) -> tuple[float, float, tuple[float,
     solid, free = solid[:: steps[0]].copy(), free[:: steps[1]].copy()
 
     def at(shift_m: FloatArray) -> float:
-        total = 0.0
-        for places, sign, step in ((solid, 1, steps[0]), (free, -1, steps[1])):
-            logs, count = view_kernels.log_chances(
-                places, shift_m, *top_field(rack).grid, sign, EDGE_SHIFT_M, EVIDENCE_BLUR_M, WRONG_SHARE
+        return sum(
+            step
+            * float(
+                view_kernels.table_sum(places, shift_m, *top_field(rack).grid, _log_chances(rack, sign), CHANCE_STEP_M)
             )
-            total += step * (logs - count * float(np.log(_mean_chance(rack, sign))))
-        return total
+            for places, sign, step in ((solid, 1, steps[0]), (free, -1, steps[1]))
+        )
 
     beside = [(at(shift), (float(shift[0]), float(shift[1]))) for shift in slot_steps_m(rack)]
     return at(np.zeros(2)), *max(beside, default=(-np.inf, (0.0, 0.0)))
@@ -159,6 +162,13 @@ def _chance(inside_m: FloatArray) -> FloatArray:
 def _mean_chance(rack: RackModel, sign: int) -> float:
     """Mean over the field: what a point has that could as well lie anywhere."""
     return float(_chance(sign * (EDGE_SHIFT_M - top_field(rack).table[::7, 0].astype(float))).mean())
+
+
+@lru_cache(maxsize=64)
+def _log_chances(rack: RackModel, sign: int) -> FloatArray:
+    """How much likelier a point is here than anywhere, nats, over its distance from the solid part."""
+    distance = CHANCE_STEP_M * np.arange(-CHANCE_STEPS, CHANCE_STEPS + 1, dtype=float)
+    return np.log(_chance(sign * (EDGE_SHIFT_M - distance)) / _mean_chance(rack, sign))
 
 
 @lru_cache(maxsize=32)

@@ -8,6 +8,7 @@ from itertools import islice
 
 import numpy as np
 
+from tubepose import rack_view_kernels as view_kernels
 from tubepose.capture.frame import CameraIntrinsics
 from tubepose.capture.session import SlotHint
 from tubepose.config import Config, RackConfig, RackTopConfig
@@ -16,10 +17,10 @@ from tubepose.preprocessing import point_spacing_m, thin
 from tubepose.rack_acceptance import outline_words, too_coarse
 from tubepose.rack_agreement import Agreement, contradiction, measure_agreement, outline_fits
 from tubepose.rack_field import top_field
-from tubepose.rack_fit import Fit, refine
+from tubepose.rack_fit import Fit, camera_place, refine, top_frame
 from tubepose.rack_pose import MIN_POINTS, RackPose, RackStatus, choose_turn
 from tubepose.rack_search import Band, levels, search
-from tubepose.transforms import HALF_TURN, FloatArray, invert_transform, make_transform, transform_points
+from tubepose.transforms import HALF_TURN, FloatArray, make_transform
 
 # A rack full of caps shows its lattice better than its ends: so many slots may the search be off.
 SLOT_STEPS = 6
@@ -149,15 +150,10 @@ def seen_near(points_m: FloatArray, T_camera_rack: FloatArray, rack: RackModel) 
 
     Samples are drawn from the points that are given: of a whole frame with a bright table few would be of the rack.
     """
-    top = make_transform(np.eye(3), np.array([0.0, 0.0, rack.height_m]))
-    T_top_camera = invert_transform(T_camera_rack @ top)
-    local = transform_points(T_top_camera, points_m)
-    camera = T_top_camera[:3, 3]
-    with np.errstate(divide="ignore", invalid="ignore"):
-        along = camera[2] / (camera[2] - local[:, 2])
-    at = camera[:2] + along[:, None] * (local[:, :2] - camera[:2])
-    near = np.all(np.abs(at) < rack.outline_m / 2 + NEAR_M, axis=1)
-    return points_m[near] if np.count_nonzero(near) >= MIN_POINTS else points_m
+    T = top_frame(T_camera_rack, rack)
+    points_m = np.ascontiguousarray(points_m, float)
+    near_m = view_kernels.seen_through(points_m, T[:3, :3], T[:3, 3], camera_place(T), rack.outline_m / 2 + NEAR_M)
+    return near_m if len(near_m) >= MIN_POINTS else points_m
 
 
 def register_at(points_m: FloatArray, T_camera_rack: FloatArray, rack: RackModel, config: RackConfig) -> Registration:

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import fft
 
+from tubepose import rack_view_kernels as view_kernels
 from tubepose.config import RackTopConfig
 from tubepose.labware import RackModel
 from tubepose.rack_field import PICTURE_M, TURNS, picture, picture_spectrum, solid_signature, top_field, turn_signature
@@ -95,8 +96,7 @@ def level_directions(points_m: FloatArray, config: RackTopConfig) -> Iterator[tu
     normals, a = normals[kept] / length[kept, None], a[kept]
     offsets = np.einsum("ij,ij->i", normals, a)
     off = normals.astype(np.float32) @ sample.T.astype(np.float32)
-    off -= offsets[:, None].astype(np.float32)
-    counts = np.count_nonzero(np.abs(off, out=off) < config.plane_distance_m, axis=1)
+    counts = view_kernels.close_counts(off, offsets.astype(np.float32), np.float32(config.plane_distance_m))
     found: list[tuple[FloatArray, FloatArray]] = []
     free = np.ones(len(normals), bool)
     while free.any() and len(found) < config.max_planes:
@@ -197,14 +197,13 @@ def _band(local_m: FloatArray, height: float, T_camera_level: FloatArray) -> Ban
     x = np.array([1.0, 0.0, slope[0]]) / np.hypot(1, slope[0])
     T_level_band = make_transform(np.stack([x, np.cross(up, x), up], axis=1), center)
     T_camera_band = T_camera_level @ T_level_band
-    flat = (rough - center) @ T_level_band[:3, :3]
-    solid = flat[np.abs(flat[:, 2]) < BAND_M, :2]
+    R = T_level_band[:3, :3]
+    solid = view_kernels.band_places(rough, R, center, BAND_M)
     if len(solid) < 50:
         return None
-    seen = local_m[:below]
-    seen = (seen[:: len(seen) // FREE_POINTS + 1] - center) @ T_level_band[:3, :3]
     camera = -T_camera_band[:3, 3] @ T_camera_band[:3, :3]
-    return Band(T_camera_band, solid, crossings(seen, camera), max(1.0, below / FREE_POINTS), T_camera_level[:3, 2])
+    free = view_kernels.crossed(local_m[:below], below // FREE_POINTS + 1, R, center, camera)
+    return Band(T_camera_band, solid, free, max(1.0, below / FREE_POINTS), T_camera_level[:3, 2])
 
 
 def _tilt(points_m: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -213,12 +212,6 @@ def _tilt(points_m: FloatArray) -> tuple[FloatArray, FloatArray]:
     off = points_m - center
     slope = np.linalg.solve(off[:, :2].T @ off[:, :2] + 1e-9 * np.eye(2), off[:, :2].T @ off[:, 2])
     return center, np.asarray(slope)
-
-
-def crossings(below_m: FloatArray, camera_m: FloatArray) -> FloatArray:
-    """Where the lines from the camera to points (N, 3) below cross z = 0, shape (N, 2)."""
-    share = below_m[:, 2] / (below_m[:, 2] - camera_m[2])
-    return np.asarray(below_m[:, :2] + share[:, None] * (camera_m[:2] - below_m[:, :2]))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -235,8 +228,8 @@ def turns(band: Band, rack: RackModel, count: int) -> list[Turn]:
     low, size = _frame(band.solid_m, rack, padded=False)
     if size > MOST_CELLS:
         return []
-    image = _raster(band.solid_m, low, size)
-    signature = turn_signature(fft.rfft2(np.minimum(image, _full(image))), size)
+    image = view_kernels.cell_counts(band.solid_m, np.eye(2), low, PICTURE_M, size)
+    signature = turn_signature(fft.rfft2(np.minimum(image, np.float32(view_kernels.median_count(image)))), size)
     norm = float(np.linalg.norm(signature))
     match = fft.irfft((fft.rfft(signature, axis=0) * solid_signature(rack)).sum(axis=1), TURNS) / max(norm, 1e-12)
     found = []
@@ -245,11 +238,6 @@ def turns(band: Band, rack: RackModel, count: int) -> list[Turn]:
         found.append(Turn(band, best * np.pi / TURNS, float(match[best])))
         match[np.arange(best - SAME_TURN, best + SAME_TURN + 1) % TURNS] = -1
     return found
-
-
-def _full(image: FloatArray) -> float:
-    """Points of a cell that is seen well: more of them say no more."""
-    return max(1.0, float(np.median(image[image > 0])))
 
 
 def _frame(points_m: FloatArray, rack: RackModel, padded: bool) -> tuple[FloatArray, int]:
@@ -261,22 +249,18 @@ def _frame(points_m: FloatArray, rack: RackModel, padded: bool) -> tuple[FloatAr
     return np.asarray((low + high) / 2 - cells * PICTURE_M / 2), fft.next_fast_len(cells, real=True)
 
 
-def _raster(xy_m: FloatArray, low_m: FloatArray, size: int) -> FloatArray:
-    index = np.floor((xy_m - low_m) * (1 / PICTURE_M)).astype(np.intp)
-    inside = np.all((index >= 0) & (index < size), axis=1)
-    flat = index[inside, 0] * size + index[inside, 1]
-    return np.bincount(flat, minlength=size * size).reshape(size, size).astype(np.float32)
-
-
 def place(turn: Turn, rack: RackModel) -> list[Hypothesis]:
     """Where the picture of the top lies best at one angle; for a top that half a turn changes, both ways round."""
     cos, sin = np.cos(turn.angle_rad), np.sin(turn.angle_rad)
     T_turned = np.array([[cos, -sin], [sin, cos]])
-    solid, free = turn.band.solid_m @ T_turned, turn.band.free_m @ T_turned
-    low, size = _frame(solid, rack, padded=True)
-    hits, misses = _raster(solid, low, size), _raster(free, low, size) * turn.band.free_weight
-    full = _full(hits)
-    evidence = np.minimum(hits, full) - np.minimum(misses, full)
+    low, size = _frame(turn.band.solid_m @ T_turned, rack, padded=True)
+    hits, misses = (
+        view_kernels.cell_counts(places, T_turned, low, PICTURE_M, size)
+        for places in (turn.band.solid_m, turn.band.free_m)
+    )
+    # Points of a cell that is seen well: more of them say no more.
+    full = float(view_kernels.median_count(hits))
+    evidence = np.minimum(hits, full) - np.minimum(misses * turn.band.free_weight, full)
     spectrum = fft.rfft2(evidence)
     half = np.array(picture(rack).shape) // 2
     found = []

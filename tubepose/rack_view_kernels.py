@@ -47,18 +47,101 @@ def cells_crossed(points_m, step, rotation, origin_m, camera_m, side_m, shape):
 
 
 @compiled
-def log_chances(xy_m, shift_m, low_m, cell_m, shape, table, sign, edge_m, blur_m, wrong):
-    """Sum of log likelihoods that places (N, 2 or more) less a shift are solid (sign 1) or free (-1), and their number.
+def seen_through(points_m, rotation, origin_m, camera_m, reach_m):
+    """Points (N, 3), unchanged, whose lines of sight cross a frame's plane within `reach_m` (2,) of its origin."""
+    kept = np.empty_like(points_m)
+    count = 0
+    for k in range(len(points_m)):
+        right, ahead, up = in_frame(points_m[k], rotation, origin_m)
+        along = camera_m[2] / (camera_m[2] - up)
+        if (
+            abs(camera_m[0] + along * (right - camera_m[0])) < reach_m[0]
+            and abs(camera_m[1] + along * (ahead - camera_m[1])) < reach_m[1]
+        ):
+            kept[count] = points_m[k]
+            count += 1
+    return kept[:count].copy()
 
-    Of those on the field's grid alone.
+
+@compiled
+def table_sum(xy_m, shift_m, low_m, cell_m, shape, table, values, step_m):
+    """Sum over places (N, 2 or more), less a shift, on a field's grid, of values that are tabled over the distance.
+
+    Values lie `step_m` apart, the middle one at distance 0; between them it is linear, beyond them constant.
     """
-    total, count = 0.0, 0
+    total, middle, last = 0.0, len(values) // 2, len(values) - 1.001
     for k in range(len(xy_m)):
         x, y = (xy_m[k, 0] - shift_m[0] - low_m[0]) / cell_m, (xy_m[k, 1] - shift_m[1] - low_m[1]) / cell_m
         if -0.5 <= x < shape[0] - 0.5 and -0.5 <= y < shape[1] - 0.5:
             i, j = math.floor(x + 0.5), math.floor(y + 0.5)
             cell = table[i * shape[1] + j]
-            inside = sign * (edge_m - cell[0] - cell_m * ((x - i) * cell[1] + (y - j) * cell[2]))
-            total += math.log(wrong + (1.0 - 2.0 * wrong) / (1.0 + math.exp(-inside / blur_m)))
+            distance = cell[0] + cell_m * ((x - i) * cell[1] + (y - j) * cell[2])
+            place = min(max(distance / step_m + middle, 0.0), last)
+            m = int(place)
+            total += values[m] + (place - m) * (values[m + 1] - values[m])
+    return total
+
+
+@compiled
+def close_counts(values, offsets, distance):
+    """How many values of every row (N, M) are within a distance of the row's offset (N,)."""
+    counts = np.empty(len(values), np.intp)
+    for k in range(len(values)):
+        count = 0
+        for value in values[k]:
+            count += abs(value - offsets[k]) < distance
+        counts[k] = count
+    return counts
+
+
+@compiled
+def cell_counts(xy_m, turn, low_m, cell_m, size):
+    """Places (N, 2), turned by a matrix that they are multiplied with from the left, counted in square cells."""
+    image = np.zeros((size, size), np.float32)
+    for k in range(len(xy_m)):
+        i = math.floor((xy_m[k, 0] * turn[0, 0] + xy_m[k, 1] * turn[1, 0] - low_m[0]) / cell_m)
+        j = math.floor((xy_m[k, 0] * turn[0, 1] + xy_m[k, 1] * turn[1, 1] - low_m[1]) / cell_m)
+        if 0 <= i < size and 0 <= j < size:
+            image[i, j] += np.float32(1.0)
+    return image
+
+
+@compiled
+def median_count(image):
+    """Median of the whole numbers of a picture that are above 0; 1 at least."""
+    counts = np.zeros(int(image.max()) + 1, np.intp)
+    for value in image.ravel():
+        counts[int(value)] += 1
+    counts[0] = 0
+    total, passed, lower = counts.sum(), 0, 0
+    for value in range(1, len(counts)):
+        passed += counts[value]
+        if lower == 0 and 2 * passed >= total:
+            lower = value
+        if 2 * passed > total:
+            return max(1.0, 0.5 * (lower + value))
+    return 1.0
+
+
+@compiled
+def band_places(points_m, rotation, origin_m, height_m):
+    """Places (N, 2) in a frame of the points (M, 3) within a height of its plane."""
+    flat = np.empty((len(points_m), 2))
+    count = 0
+    for k in range(len(points_m)):
+        right, ahead, up = in_frame(points_m[k], rotation, origin_m)
+        if abs(up) < height_m:
+            flat[count, 0], flat[count, 1] = right, ahead
             count += 1
-    return total, count
+    return flat[:count].copy()
+
+
+@compiled
+def crossed(points_m, step, rotation, origin_m, camera_m):
+    """Where the lines of sight to every `step`-th point (N, 3) cross a frame's plane, shape (M, 2)."""
+    at = np.empty(((len(points_m) + step - 1) // step, 2))
+    for k in range(len(at)):
+        right, ahead, up = in_frame(points_m[k * step], rotation, origin_m)
+        share = up / (up - camera_m[2])
+        at[k, 0], at[k, 1] = right + share * (camera_m[0] - right), ahead + share * (camera_m[1] - ahead)
+    return at
