@@ -38,7 +38,7 @@ def near_top(points_m, rotation, origin_m, reach_m, height_m):
         if abs(up) < height_m and abs(right) < reach_m[0] and abs(ahead) < reach_m[1]:
             kept[count] = points_m[k]
             count += 1
-    return kept[:count].copy()
+    return kept[:count]
 
 
 @compiled

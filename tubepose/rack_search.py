@@ -241,12 +241,22 @@ def turns(band: Band, rack: RackModel, count: int) -> list[Turn]:
 
 
 def _frame(points_m: FloatArray, rack: RackModel, padded: bool) -> tuple[FloatArray, int]:
-    low, high = np.percentile(points_m, [0.5, 99.5], axis=0)
+    low, high = _ends(points_m)
     side = float((high - low).max()) + 10e-3
     if padded:
         side = max(side, float((high - low).max()) + 0.5 * float(np.hypot(*rack.outline_m)))
     cells = max(int(side / PICTURE_M), 200) + 1
     return np.asarray((low + high) / 2 - cells * PICTURE_M / 2), fft.next_fast_len(cells, real=True)
+
+
+def _ends(points_m: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Percentiles 0.5 and 99.5 of points (N, 2), shape (2,) each."""
+    ranks = np.array([0.005, 0.995]) * (len(points_m) - 1)
+    below = ranks.astype(np.intp)
+    above = np.minimum(below + 1, len(points_m) - 1)
+    ordered = np.partition(points_m.T.copy(), np.unique([below, above]), axis=1)
+    low, high = ordered[:, below].T + (ranks - below)[:, None] * (ordered[:, above] - ordered[:, below]).T
+    return low, high
 
 
 def place(turn: Turn, rack: RackModel) -> list[Hypothesis]:
@@ -260,7 +270,7 @@ def place(turn: Turn, rack: RackModel) -> list[Hypothesis]:
     )
     # Points of a cell that is seen well: more of them say no more.
     full = float(view_kernels.median_count(hits))
-    evidence = np.minimum(hits, full) - np.minimum(misses * turn.band.free_weight, full)
+    evidence = view_kernels.clipped(hits, misses, np.float32(turn.band.free_weight), np.float32(full))
     spectrum = fft.rfft2(evidence)
     half = np.array(picture(rack).shape) // 2
     found = []

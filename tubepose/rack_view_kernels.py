@@ -29,7 +29,7 @@ def labelled(points_m, rotation, origin_m, camera_m, reach_m, window_m, through_
             else:
                 solid[solids, 0], solid[solids, 1], solid[solids, 2] = right, ahead, up
                 solids += 1
-    return solid[:solids].copy(), free[:frees].copy()
+    return solid[:solids], free[:frees]
 
 
 @compiled
@@ -60,7 +60,7 @@ def seen_through(points_m, rotation, origin_m, camera_m, reach_m):
         ):
             kept[count] = points_m[k]
             count += 1
-    return kept[:count].copy()
+    return kept[:count]
 
 
 @compiled
@@ -110,9 +110,10 @@ def cell_counts(xy_m, turn, low_m, cell_m, size):
 def median_count(image):
     """Median of the whole numbers of a picture that are above 0; 1 at least."""
     counts = np.zeros(int(image.max()) + 1, np.intp)
-    for value in image.ravel():
-        counts[int(value)] += 1
-    counts[0] = 0
+    for row in image:
+        for value in row:
+            if value > 0:
+                counts[int(value)] += 1
     total, passed, lower = counts.sum(), 0, 0
     for value in range(1, len(counts)):
         passed += counts[value]
@@ -121,6 +122,16 @@ def median_count(image):
         if 2 * passed > total:
             return max(1.0, 0.5 * (lower + value))
     return 1.0
+
+
+@compiled
+def clipped(hits, misses, weight, full):
+    """Hits less misses, which have a weight, both counted up to `full`."""
+    picture = np.empty_like(hits)
+    for i in range(hits.shape[0]):
+        for j in range(hits.shape[1]):
+            picture[i, j] = min(hits[i, j], full) - min(misses[i, j] * weight, full)
+    return picture
 
 
 @compiled
@@ -133,7 +144,7 @@ def band_places(points_m, rotation, origin_m, height_m):
         if abs(up) < height_m:
             flat[count, 0], flat[count, 1] = right, ahead
             count += 1
-    return flat[:count].copy()
+    return flat[:count]
 
 
 @compiled
