@@ -183,7 +183,7 @@ def _uncertainty_notes(errors: pd.DataFrame, measured: MeasuredTruth) -> list[st
     own = "" if EXACT_NOTE in measured.notes else " (the truth's own error is not in that)"
     return [
         f"{row['method']}: {row['inside_95']:.1%} of {row['n']} truths inside the stated 95 % region{own}; "
-        f"mean tilt error {row['tilt_deg_all']:.2f} deg of all, {row['tilt_deg_best_half']:.2f} of the better scored half."
+        f"mean tilt error {row['tilt_deg_all']:.2f} deg of all, {row['tilt_deg_best_half']:.2f} of the better half."
         for row in rows
     ]
 
