@@ -1,0 +1,86 @@
+"""The programs behind the claims: the floor of an ideal estimator, and the verdicts on rows of errors."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from benchmarks import claims, floor
+from tubepose.labware import load_rack, load_tube
+
+RACK = load_rack("chen2023-soft-5x10")
+CAPPED = load_tube("chen2023-tube-3")
+SESSION = SimpleNamespace(tubes={CAPPED.name: CAPPED})
+
+
+@pytest.fixture
+def few(monkeypatch):
+    monkeypatch.setattr(floor, "DRAWS", 3000)
+    monkeypatch.setattr(floor, "JUDGED", 60)
+
+
+def floor_of(top_std_m, slope_std):
+    rng = np.random.default_rng(0)
+    held, slope = floor.draw(RACK, CAPPED, rng)
+    found = list(floor.posterior_means(held, slope, CAPPED, top_std_m, slope_std, rng))
+    return np.abs([entry[0] for entry in found]).mean(), np.abs(slope).mean()
+
+
+def test_the_floor_falls_with_what_is_known(few):
+    nothing, spread = floor_of(1.0, np.inf)
+    top_only, _ = floor_of(0.1e-3, np.inf)
+    both, _ = floor_of(0.1e-3, np.deg2rad(0.15))
+    assert nothing == pytest.approx(spread, rel=0.2)
+    assert both < 0.75 * top_only < 0.5 * nothing
+
+
+def test_a_crooked_cap_is_part_of_the_floor(few):
+    small, _ = floor_of(0.1e-3, np.deg2rad(0.1))
+    large, _ = floor_of(0.1e-3, np.deg2rad(0.3))
+    assert small < large
+
+
+def errors(method, rx_deg, tx_mm, outcomes=("ok",)):
+    rows = []
+    for trial in range(4):
+        for slot, outcome in enumerate(outcomes):
+            rows.append(
+                {
+                    "session": "s", "trial": f"t{trial}", "slot": f"A{slot}", "tube": CAPPED.name, "method": method,
+                    "outcome": outcome, "rx_deg": rx_deg, "ry_deg": 0.0, "tilt_deg": abs(rx_deg), "tx_mm": tx_mm,
+                    "ty_mm": 0.0, "tz_mm": 0.0, "cap_mm": 0.0,
+                }
+            )  # fmt: skip
+    return pd.DataFrame(rows)
+
+
+@pytest.mark.parametrize(
+    ("rx_deg", "tx_mm", "outcomes", "verdicts"),
+    [
+        (0.1, 0.1, ("ok",), (True, True, True, True)),
+        (0.13, 0.1, ("ok",), (False, True, True, True)),
+        (0.5, 0.1, ("ok",), (False, False, True, True)),
+        (0.1, 0.3, ("ok",), (True, True, False, True)),
+        (0.1, 2.1, ("ok",), (True, True, False, False)),
+        (0.1, 0.1, ("ok", "missed"), (True, True, True, False)),
+    ],
+)
+def test_targets_are_met_or_not(rx_deg, tx_mm, outcomes, verdicts):
+    (row,) = claims.accuracy_rows(errors("profile", rx_deg, tx_mm, outcomes), SESSION, "exact")
+    assert (row["R met"], row["p95 met"], row["T met"], row["kept, none wrong"]) == verdicts
+
+
+def test_rivals_are_behind_level_or_ahead():
+    table = pd.concat([errors("profile", 0.1, 0.1), errors("worse", 0.3, 0.1), errors("better", 0.05, 0.1)])
+    told = {row["rival"]: row for row in claims.rival_rows(table, "exact")}
+    assert told["worse"]["rx_deg"].endswith("ahead")
+    assert told["worse"]["tx_mm"].endswith("level")
+    assert told["better"]["rx_deg"].endswith("behind")
+    assert told["worse"]["pairs"] == 4
+
+
+def test_the_gain_is_on_tubes_that_both_answered():
+    trivial = errors("upright", 0.6, 0.5, ("ok", "ok"))
+    (row,) = claims.gain_rows(pd.concat([errors("profile", 0.2, 0.1, ("ok", "rejected")), trivial]), "exact")
+    assert row["ratio"] == pytest.approx(3.0)
