@@ -13,7 +13,7 @@ from tubepose.capture.frame import CameraIntrinsics
 from tubepose.capture.session import SlotHint
 from tubepose.config import Config
 from tubepose.labware import RackModel
-from tubepose.preprocessing import level_noise_m, plausible_unit_factors
+from tubepose.preprocessing import level_noise_m, plausible_unit_factors, thin
 from tubepose.rack_acceptance import outline_words, too_noisy
 from tubepose.rack_edges import register_edges
 from tubepose.rack_obb import rack_template_m, register_obb_icp
@@ -24,6 +24,9 @@ _Method = Callable[
     [FloatArray, RackModel, Config, SlotHint | None, CameraIntrinsics | None],
     RackPose,
 ]
+# Points that tell a smooth scan, or a rough one, from a doubtful one, and shares of the limit where they do.
+NOISE_POINTS = 20_000
+CLEAR_NOISE = (0.75, 1.3)
 _METHODS: dict[str, _Method] = {"edges": register_edges, "obb-icp": register_obb_icp}
 
 
@@ -53,10 +56,19 @@ def register_rack(
     if reason:
         return replace(pose, status=RackStatus.UNIT, reason=reason)
     if pose.status is not RackStatus.INSUFFICIENT:
-        noise_m = level_noise_m(points_m, config.rack_top)
+        noise_m = _noise_m(points_m, config)
         if noise_m > config.rack.max_inlier_rmse_m:
             return replace(pose, status=RackStatus.INSUFFICIENT, reason=too_noisy(noise_m, pose.reason, config.rack))
     return pose
+
+
+def _noise_m(points_m: FloatArray, config: Config) -> float:
+    """How far depth scatters, metres: told by a sample, and by all points where that is near the limit."""
+    noise_m = level_noise_m(thin(points_m, NOISE_POINTS), config.rack_top)
+    low, high = CLEAR_NOISE
+    if noise_m < low * config.rack.max_inlier_rmse_m or noise_m > high * config.rack.max_inlier_rmse_m:
+        return noise_m
+    return level_noise_m(points_m, config.rack_top)
 
 
 def _unit_suspicion(points_m: FloatArray, rack: RackModel, config: Config, method: _Method) -> str:

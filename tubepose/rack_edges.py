@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from itertools import islice
 
@@ -78,11 +78,19 @@ def best_registration(
     """The registration with most evidence of those that nothing contradicts, else of all; None where no band is found.
 
     The first one that sees much of the top is taken: only where little is seen can another place look like the rack.
-    Places that are worth much less than one that was accepted are not looked at, and no more than `most`.
+    Places that are worth much less than one that was accepted are not looked at, nor, if hardly a point contradicts it,
+    those on other level directions than its own; and no more than `most`.
     """
     found: list[Registration] = []
     worth = 0.0
-    for hypothesis in islice(search(found_levels, rack), most):
+
+    def until_settled() -> Iterator[list[Band]]:
+        for level in found_levels:
+            yield level
+            if any(not other.reason and _uncontradicted(other, config.rack) for other in found):
+                return
+
+    for hypothesis in islice(search(until_settled(), rack), most):
         if hypothesis.worth < RIVAL_WORTH * worth or _known(hypothesis.T_camera_rack, found, rack):
             continue
         registration = register_at(points_m, hypothesis.T_camera_rack, rack, config.rack)
@@ -98,8 +106,11 @@ def best_registration(
 
 def _clear(registration: Registration, config: RackConfig) -> bool:
     """Whether no other place needs to be looked at: much is seen, and hardly a point contradicts."""
-    seen = registration.agreement
-    return seen.coverage >= config.clear_seen and seen.in_slot <= config.max_stray_share / 2
+    return registration.agreement.coverage >= config.clear_seen and _uncontradicted(registration, config)
+
+
+def _uncontradicted(registration: Registration, config: RackConfig) -> bool:
+    return registration.agreement.in_slot <= config.max_stray_share / 2
 
 
 def _likeliest(found: list[Registration], rack: RackModel, config: RackConfig) -> Registration | None:
@@ -162,7 +173,9 @@ def register_at(points_m: FloatArray, T_camera_rack: FloatArray, rack: RackModel
     fit = refine(near_m, T_camera_rack, rack)
     agreement = measure_agreement(near_m, fit, rack, config)
     for _ in range(SLOT_STEPS):
-        if agreement.slot_margin >= 0 or agreement.in_slot > 2 * config.max_stray_share:
+        # No step smooths what is rough, nor empties openings.
+        rough = agreement.in_slot > 2 * config.max_stray_share or agreement.rmse_m > config.max_inlier_rmse_m
+        if agreement.slot_margin >= 0 or rough:
             break
         T_step = make_transform(np.eye(3), np.array([*agreement.step_m, 0.0]))
         near_m = seen_near(points_m, fit.T_camera_rack @ T_step, rack)
