@@ -78,19 +78,24 @@ def fit_profiles(
     posterior = fuse(measured, models, rack, config.profile)
     covariance = pose_covariance(posterior, measured, models, rack, config.profile, rack_covariance)
     rise = _rise_m(measured, models, rack, config.profile)
-    counts = np.bincount(measured.label[measured.label >= 0], minlength=len(models))
-    order = np.argsort(measured.label, kind="stable")
-    ends = np.cumsum(counts) + np.count_nonzero(measured.label < 0)
+    clouds = _clouds(measured, len(models))
     found = []
     for i, tube in enumerate(models):
         slot = rack.all_slots[measured.tops.slot[i]]
-        points_m = measured.points.points_m[order[ends[i] - counts[i] : ends[i]]]
-        pose = _pose(i, measured, posterior, covariance[i], float(rise[i]), tube, rack, config.profile)
+        pose = _pose(i, measured, posterior, covariance[i], float(rise[i]), tube, rack, config.profile, len(clouds[i]))
         crowd = next((left.reason for left in leftovers if left.slot == measured.tops.slot[i]), "")
         if crowd and pose.status is TubeStatus.OK:
             pose = _rejected(pose, f"two tubes in one slot: {crowd}")
-        found.append(ProfileTube(slot.name, tube, float(measured.tops.support[i]), points_m, pose))
+        found.append(ProfileTube(slot.name, tube, float(measured.tops.support[i]), clouds[i], pose))
     return (*found, *(_no_tube(left, measured, rack) for left in leftovers))
+
+
+def _clouds(measured: Measured, count: int) -> list[FloatArray]:
+    """The points of every tube, shape (N, 3) each."""
+    label = measured.label.astype(np.int16)
+    ordered = measured.points.points_m[np.argsort(label, kind="stable")]
+    ends = np.cumsum(np.bincount(label + 1, minlength=count + 1))
+    return [ordered[ends[i] : ends[i + 1]] for i in range(count)]
 
 
 def _all_standing(
@@ -187,6 +192,7 @@ def _pose(
     tube: TubeModel,
     rack: RackModel,
     config: ProfileConfig,
+    n_points: int,
 ) -> TubePose:
     """Pose and verdict of one tube."""
     u, v, a, b = posterior.mean[i]
@@ -209,7 +215,7 @@ def _pose(
         score=score(tilt_std, sectors, allowed, config),
         inlier_rmse_m=float(measured.planes.rms_m[i]),
         fitness=sectors,
-        n_points=int(np.count_nonzero(measured.label == i)),
+        n_points=n_points,
         covariance=covariance,
     )
 

@@ -67,6 +67,31 @@ def near_planes(points_m, label, centers_m, levels_m, band_m, usable):
 
 
 @njit(cache=True)
+def ends_on_planes(points_m, rows, of, offset_m, planes, least_m, near_m, centers_m, camera_m):
+    """Points of tops that are far enough out and on their planes (T, 3): their tubes, and their offsets (N, 2).
+
+    The offset is where the line of sight crosses the plane's height there, from the tube's centre.
+    """
+    kept = np.empty(len(rows), np.intp)
+    flat_m = np.empty((len(rows), 2))
+    count = 0
+    for i in range(len(rows)):
+        t = of[i]
+        x, y = offset_m[i, 0], offset_m[i, 1]
+        if x * x + y * y > least_m[t] * least_m[t]:
+            k = rows[i]
+            height = planes[t, 0] + planes[t, 1] * x + planes[t, 2] * y
+            # False for a plane that is not known.
+            if abs(points_m[k, 2] - height) < near_m:
+                along = (height - camera_m[2]) / (points_m[k, 2] - camera_m[2])
+                kept[count] = t
+                flat_m[count, 0] = camera_m[0] + (points_m[k, 0] - camera_m[0]) * along - centers_m[t, 0]
+                flat_m[count, 1] = camera_m[1] + (points_m[k, 1] - camera_m[1]) * along - centers_m[t, 1]
+                count += 1
+    return kept[:count].copy(), flat_m[:count].copy()
+
+
+@njit(cache=True)
 def plane_sums(label, offset_m, height_m, planes, sigma_m, step):
     """Sums of Tukey's weights w about planes (T, 3), shape (T, 11): of every `step`-th point.
 

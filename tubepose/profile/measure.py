@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from tubepose.capture.frame import CameraIntrinsics, RgbdFrame
 from tubepose.config import Config, ProfileConfig
 from tubepose.labware import RackModel, TubeModel
-from tubepose.profile.kernels import cell_values, near_planes
+from tubepose.profile.kernels import cell_values, ends_on_planes, near_planes
 from tubepose.profile.outline import NORMALS, OUTLINE_DEPTH_M, Circles, fit_discs, unknown_circles
 from tubepose.profile.plane import TopPlanes, fit_top_planes
 from tubepose.profile.rims import fit_rims
@@ -185,13 +185,10 @@ def _measure_closed(
     rows, of, offset = near_planes(
         standing.points_m, label, tops.center_m, shape.level_m, config.top_band_m, ~shape.open
     )
-    points_m = standing.points_m[rows]
-    planes = fit_top_planes(of, offset, points_m[:, 2], shape.level_m, shape.radius_m, config)
-    outer = np.flatnonzero(np.einsum("ij,ij->i", offset, offset) > (shape.radius_m - OUTLINE_DEPTH_M)[of] ** 2)
-    of, points_m = of[outer], points_m[outer]
-    height = planes.height_at(of, offset[outer])
-    with np.errstate(invalid="ignore"):
-        on = np.flatnonzero(np.abs(points_m[:, 2] - height) < ON_PLANE_M)
-    flat = standing.on_level(height[on], points_m[on]) - tops.center_m[of[on]]
+    planes = fit_top_planes(of, offset, standing.points_m[rows, 2], shape.level_m, shape.radius_m, config)
+    ends_of, flat = ends_on_planes(
+        standing.points_m, rows, of, offset, np.column_stack([planes.height_m, planes.slope]),
+        np.maximum(shape.radius_m - OUTLINE_DEPTH_M, 0.0), ON_PLANE_M, tops.center_m, standing.camera_m,
+    )  # fmt: skip
     blocked = blocked_sectors(tops.center_m, shape.radius_m, DISC_GAP_M)
-    return planes, fit_discs(of[on], flat, shape.radius_m, blocked, config)
+    return planes, fit_discs(ends_of, flat, shape.radius_m, blocked, config)

@@ -67,7 +67,7 @@ def fit_top_planes(
     inside &= np.abs(height_m - expected_m[label]) < config.top_band_m
     label, xy, z = label[inside], offset_m[inside], height_m[inside]
     step = max(1, len(z) // max(config.plane_points * count, 1))
-    planes = np.column_stack([_median_per_label(label[::step], z[::step], expected_m), np.zeros((count, 2))])
+    planes = np.column_stack([_median_per_label(label[:: 4 * step], z[:: 4 * step], expected_m), np.zeros((count, 2))])
     sigma = np.full(count, config.top_band_m / 3)
     n = np.zeros(count, np.intp)
     for every in (*[step] * ROUNDS, 1):
