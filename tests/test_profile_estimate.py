@@ -368,3 +368,12 @@ def test_a_floor_that_is_not_known_is_found_from_the_tops(frame, found, off_mm):
 def test_a_floor_that_is_known_is_not_moved(frame):
     off = RACK.model_copy(update={"floor_mm": RACK.floor_mm + 7.0})
     assert all(entry.pose.status is TubeStatus.REJECTED for entry in ps.fit(frame, VIEW, off, TUBES))
+
+
+def test_types_with_the_same_top_are_not_told_apart(frame):
+    twin = HIGH.model_copy(update={"name": "twin"})
+    tubes = ps.by_slot(ps.fit(frame, VIEW, RACK, (*TUBES, twin)))
+    alike = {slot for slot, (tube, _) in PLACED.items() if tube is HIGH}
+    assert {slot for slot, entry in tubes.items() if entry.pose.status is not TubeStatus.OK} == alike
+    for slot in alike:
+        assert tubes[slot].pose.reason.startswith("another of the given types fits its top as well as ")

@@ -202,6 +202,7 @@ class ProfileConfig(_Section):
         slope_std: Width of the proposal in the slope of the axis; wider than any slot allows.
         slot_tolerance_m: How soft the walls of the slot and the edge of its floor's play are.
         min_allowed: Least share of what the measurements leave open that the slot must allow.
+        max_runner_up: A type whose top another one fits with this share of its support is not told apart.
         max_height_error_m: A closed top farther off its height than this is rejected.
         max_tilt_std_rad: A tilt that is not known better than this is rejected.
         score_tilt_rad: Standard deviation of the tilt at which the score is a half.
@@ -234,6 +235,7 @@ class ProfileConfig(_Section):
     slot_tolerance_m: float = 1.0e-4
     min_allowed: float = 1.0e-3
     max_height_error_m: float = 1.2e-3
+    max_runner_up: float = 0.9
     max_tilt_std_rad: float = 0.0105
     score_tilt_rad: float = 0.0035
 

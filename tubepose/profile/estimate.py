@@ -207,6 +207,7 @@ def _pose(
     reason = rejection(
         sectors=sectors, allowed=allowed, high_m=high, tilt_std_rad=tilt_std, tube=tube, rack=rack, slot=slot.name,
         config=config, looked_at=not tube.is_open or bool(np.isfinite(measured.circles.widening_m[i])),
+        runner_up=float(measured.tops.runner_up[i] / measured.tops.support[i]),
     )  # fmt: skip
     return TubePose(
         TubeStatus.REJECTED if reason else TubeStatus.OK,

@@ -34,10 +34,6 @@ class TopPlanes:
     rms_m: FloatArray
     n_points: NDArray[np.intp]
 
-    def height_at(self, label: NDArray[np.intp], offset_m: FloatArray) -> FloatArray:
-        """Height of each point's plane at its offset (N, 2) from its tube's centre, shape (N,), metres."""
-        return np.asarray(self.height_m[label] + np.einsum("ij,ij->i", self.slope[label], offset_m))
-
 
 def fit_top_planes(
     label: NDArray[np.intp],

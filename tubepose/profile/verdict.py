@@ -19,6 +19,7 @@ def rejection(
     slot: str,
     config: ProfileConfig,
     looked_at: bool = True,
+    runner_up: float = 0.0,
 ) -> str:
     """Why a pose cannot be believed; empty if it can.
 
@@ -32,7 +33,10 @@ def rejection(
         slot: Name of the slot.
         config: Limits.
         looked_at: Whether there were pixels to look at an open rim in.
+        runner_up: Support of the next best type over that of this one.
     """
+    if runner_up > config.max_runner_up:
+        return f"another of the given types fits its top as well as {tube.name} ({runner_up:.0%} of its support)"
     if not looked_at:
         return "an open rim is measured in the image, and this cloud has no pixels"
     if sectors < config.min_sectors:
