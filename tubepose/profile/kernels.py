@@ -92,8 +92,10 @@ def ends_on_planes(points_m, rows, of, offset_m, planes, least_m, near_m, center
 
 
 @njit(cache=True)
-def plane_sums(label, offset_m, height_m, planes, sigma_m, step):
+def plane_sums(label, offset_m, height_m, expected_m, band_m, radius_m, planes, sigma_m, step):
     """Sums of Tukey's weights w about planes (T, 3), shape (T, 11): of every `step`-th point.
+
+    Points farther out than their tube's radius, or farther than the band from its expected height, do not count.
 
     In order: w, wx, wy, wxx, wxy, wyy, wz, wxz, wyz, w times the squared residual, and the number of points.
     """
@@ -101,6 +103,8 @@ def plane_sums(label, offset_m, height_m, planes, sigma_m, step):
     for k in range(0, len(label), step):
         t = label[k]
         x, y, z = offset_m[k, 0], offset_m[k, 1], height_m[k]
+        if x * x + y * y >= radius_m[t] * radius_m[t] or abs(z - expected_m[t]) >= band_m:
+            continue
         residual = z - planes[t, 0] - planes[t, 1] * x - planes[t, 2] * y
         u = residual / (4.0 * sigma_m[t])
         if abs(u) < 1.0:

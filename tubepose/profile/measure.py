@@ -12,7 +12,7 @@ from tubepose.capture.frame import CameraIntrinsics, RgbdFrame
 from tubepose.config import Config, ProfileConfig
 from tubepose.labware import RackModel, TubeModel
 from tubepose.profile.kernels import cell_values, ends_on_planes, near_planes
-from tubepose.profile.outline import NORMALS, OUTLINE_DEPTH_M, Circles, fit_discs, unknown_circles
+from tubepose.profile.outline import NORMALS, OUTLINE_DEPTH_M, SECTORS, Circles, fit_discs, unknown_circles
 from tubepose.profile.plane import TopPlanes, fit_top_planes
 from tubepose.profile.rims import fit_rims
 from tubepose.profile.standing import Standing, gather_standing
@@ -167,12 +167,17 @@ def blocked_sectors(
 
     Only tops that are `sure`, shape (T,), block others; all by default.
     """
-    edge = center_m[:, None, :] + radius_m[:, None, None] * NORMALS[None]
-    gap = np.linalg.norm(edge[:, :, None] - center_m[None, None], axis=-1) - radius_m[None, None, :]
-    gap[np.arange(len(radius_m)), :, np.arange(len(radius_m))] = np.inf
+    count = len(radius_m)
+    apart = np.linalg.norm(center_m[:, None] - center_m[None], axis=2)
+    near = (apart < radius_m[:, None] + radius_m[None] + gap_m) & ~np.eye(count, dtype=bool)
     if sure is not None:
-        gap[:, :, ~sure] = np.inf
-    return np.asarray(gap.min(axis=2, initial=np.inf) < gap_m)
+        near &= sure[None]
+    mine, other = np.nonzero(near)
+    edge = center_m[mine, None, :] + radius_m[mine, None, None] * NORMALS
+    gap = np.linalg.norm(edge - center_m[other, None, :], axis=2) - radius_m[other, None]
+    blocked = np.zeros((count, SECTORS), bool)
+    np.logical_or.at(blocked, mine, gap < gap_m)
+    return blocked
 
 
 def _measure_closed(

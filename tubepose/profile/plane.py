@@ -12,6 +12,8 @@ from tubepose.profile.kernels import plane_sums
 from tubepose.transforms import FloatArray
 
 ROUNDS = 4
+EDGE_M = 1.0e-3
+"""Points this near the end of a top are mixed with its background."""
 LEAST_SIGMA_M = 3.0e-5
 """No sensor is better: points on a perfect plane must not be thrown out for rounding."""
 
@@ -59,15 +61,17 @@ def fit_top_planes(
         config: Noise of a cap's top.
     """
     count = len(expected_m)
-    inside = np.hypot(*offset_m.T) < radius_m[label] - 1e-3
-    inside &= np.abs(height_m - expected_m[label]) < config.top_band_m
-    label, xy, z = label[inside], offset_m[inside], height_m[inside]
-    step = max(1, len(z) // max(config.plane_points * count, 1))
-    planes = np.column_stack([_median_per_label(label[:: 4 * step], z[:: 4 * step], expected_m), np.zeros((count, 2))])
+    inner_m = np.maximum(radius_m - EDGE_M, 0.0)
+    step = max(1, len(height_m) // max(config.plane_points * count, 1))
+    few = np.s_[:: 4 * step]
+    inside = np.hypot(*offset_m[few].T) < inner_m[label[few]]
+    inside &= np.abs(height_m[few] - expected_m[label[few]]) < config.top_band_m
+    start = _median_per_label(label[few][inside], height_m[few][inside], expected_m)
+    planes = np.column_stack([start, np.zeros((count, 2))])
     sigma = np.full(count, config.top_band_m / 3)
     n = np.zeros(count, np.intp)
     for every in (*[step] * ROUNDS, 1):
-        sums = plane_sums(label, xy, z, planes, sigma, every)
+        sums = plane_sums(label, offset_m, height_m, expected_m, config.top_band_m, inner_m, planes, sigma, every)
         planes = _solve(sums, planes, config)
         sigma = np.maximum(np.sqrt(sums[:, 9] / np.maximum(sums[:, 0], 1e-9)), LEAST_SIGMA_M)
         n = sums[:, 10].astype(np.intp)
