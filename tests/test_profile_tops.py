@@ -9,8 +9,8 @@ from tubepose.profile.measure import NEAR_TOP_M, label_points
 from tubepose.profile.standing import Standing
 from tubepose.profile.tops import (
     find_tops,
-    in_top_band,
     mouth_radius_m,
+    top_depth_m,
     top_level_m,
     top_radius_m,
     top_reach_m,
@@ -54,11 +54,9 @@ def test_the_measures_of_tops_by_hand():
     assert top_radius_m(bare) == pytest.approx(17.5e-3 / 2)
 
 
-def test_bands_of_heights():
-    at = top_level_m(LOW, RACK) + np.array([-2e-3, -1e-3, 0.0, 1e-3, 2e-3])
-    assert in_top_band(at, LOW, RACK, CONFIG).tolist() == [False, True, True, True, False]
-    at = top_level_m(OPEN, RACK) + np.array([-4e-3, -3e-3, 0.0, 2e-3])
-    assert in_top_band(at, OPEN, RACK, CONFIG).tolist() == [False, True, True, False]
+def test_points_below_a_rim_can_be_of_it_and_those_below_a_cap_cannot():
+    assert top_depth_m(LOW, CONFIG) == CONFIG.top_band_m
+    assert top_depth_m(OPEN, CONFIG) == CONFIG.rim_depth_m > CONFIG.top_band_m
 
 
 @pytest.mark.parametrize("off_mm", [(0.0, 0.0), (1.2, -0.8), (-1.5, 1.0)])

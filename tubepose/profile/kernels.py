@@ -1,6 +1,7 @@
 """The loops over points, compiled: one pass each instead of a dozen arrays. The machine code is kept (`cache=True`).
 
-Sums are made in the order of the points, so results do not depend on threads; arguments are changed in none of them.
+Sums are made in the order of the points, so results do not depend on threads. No argument is changed but the pictures
+that `level_pictures` fills.
 """
 
 from __future__ import annotations
@@ -29,6 +30,25 @@ def points_over(cloud_m, rotation, translation_m, lowest_m, highest_m, half_m):
                     points[count, 0], points[count, 1], points[count, 2] = right, ahead, up
                     count += 1
     return points[:count].copy()
+
+
+@njit(cache=True)
+def level_pictures(points_m, step, camera_m, level_m, below_m, above_m, half_m, cell_m, filled, off):
+    """Fill two pictures (X, Y) of the points near a level as seen from above: 1 where there is one, and its height.
+
+    Every `step`-th point counts, at the place where its line of sight crosses the level; heights are above it. The
+    pictures are empty ones of the caller's; their first cell has its middle at `-half_m`.
+    """
+    for k in range(0, len(points_m), step):
+        height = points_m[k, 2] - level_m
+        if -below_m < height < above_m:
+            along = (level_m - camera_m[2]) / (points_m[k, 2] - camera_m[2])
+            x = camera_m[0] + (points_m[k, 0] - camera_m[0]) * along
+            y = camera_m[1] + (points_m[k, 1] - camera_m[1]) * along
+            if abs(x) < half_m[0] and abs(y) < half_m[1]:
+                i, j = int((x + half_m[0]) / cell_m + 0.5), int((y + half_m[1]) / cell_m + 0.5)
+                filled[i, j] = 1.0
+                off[i, j] = height
 
 
 @njit(cache=True)

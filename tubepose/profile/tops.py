@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from tubepose.config import ProfileConfig
 from tubepose.labware import RackModel, SlotModel, TubeModel
+from tubepose.profile.kernels import level_pictures
 from tubepose.profile.standing import OUTSIDE_M, Standing
 from tubepose.transforms import FloatArray
 
@@ -57,11 +58,9 @@ def top_radius_m(tube: TubeModel) -> float:
     return tube.cap.diameter_mm * 0.5e-3 if tube.cap is not None else float(tube.body_radius_m(tube.rim_height_m))
 
 
-def in_top_band(heights_m: FloatArray, tube: TubeModel, rack: RackModel, config: ProfileConfig) -> NDArray[np.bool_]:
-    """Which heights above the rack's base can be of a tube's top; light returns from below the surface of a rim."""
-    off = heights_m - top_level_m(tube, rack)
-    below = config.rim_depth_m if tube.is_open else config.top_band_m
-    return np.asarray((off > -below) & (off < config.top_band_m))
+def top_depth_m(tube: TubeModel, config: ProfileConfig) -> float:
+    """How far below its height points can be of a tube's top, metres: light returns from below the surface of a rim."""
+    return config.rim_depth_m if tube.is_open else config.top_band_m
 
 
 def find_tops(
@@ -129,17 +128,15 @@ def _filled(
     standing: Standing, rack: RackModel, tube: TubeModel, config: ProfileConfig
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Pictures from above of the points near a type's top: 1 in cells of `CELL_M` that have one; its height off it."""
-    # Some points a cell are enough.
-    points_m = standing.points_m[:: max(1, len(standing.points_m) // PICTURE_POINTS)]
-    near = points_m[in_top_band(points_m[:, 2], tube, rack, config)]
     half = rack.outline_m / 2 + OUTSIDE_M
     size = np.ceil(2 * half / CELL_M).astype(int) + 1
     filled, off = np.zeros(size, np.float32), np.zeros(size, np.float32)
-    xy = standing.on_level(top_level_m(tube, rack), near)
-    inside = (np.abs(xy[:, 0]) < half[0]) & (np.abs(xy[:, 1]) < half[1])
-    cells = np.rint((xy[inside] + half) / CELL_M).astype(np.intp)
-    filled[cells[:, 0], cells[:, 1]] = 1.0
-    off[cells[:, 0], cells[:, 1]] = near[inside, 2] - top_level_m(tube, rack)
+    # Some points a cell are enough.
+    step = max(1, len(standing.points_m) // PICTURE_POINTS)
+    below, level = top_depth_m(tube, config), top_level_m(tube, rack)
+    level_pictures(
+        standing.points_m, step, standing.camera_m, level, below, config.top_band_m, half, CELL_M, filled, off
+    )
     return filled, off
 
 
