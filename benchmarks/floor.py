@@ -18,7 +18,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from tubepose.labware import RackModel, TubeModel, load_rack, load_tube
-from tubepose.simulation.placement import lean, pivot_height_m
+from tubepose.simulation.placement import lean
 from tubepose.simulation.variation import Tolerances
 from tubepose.transforms import FloatArray
 
@@ -37,7 +37,7 @@ def draw(rack: RackModel, tube: TubeModel, rng: np.random.Generator) -> tuple[Fl
     poses = np.array([lean(rack, slot, tube, rng) for _ in range(DRAWS)])
     axis = poses[:, :3, 2]
     slope = axis[:, :2] / axis[:, 2:]
-    held = poses[:, :2, 3] + pivot_height_m(tube) * axis[:, :2] - slot.center_m
+    held = poses[:, :2, 3] + tube.pivot_height_m * axis[:, :2] - slot.center_m
     return held, slope
 
 
@@ -45,7 +45,7 @@ def posterior_means(
     held: FloatArray, slope: FloatArray, tube: TubeModel, top_std_m: float, slope_std: float, rng: np.random.Generator
 ) -> Iterator[tuple[FloatArray, FloatArray]]:
     """Errors of slope (2,) and of the bottom (2,), metres, of the ideal estimator for some of the drawn tubes."""
-    pivot = pivot_height_m(tube)
+    pivot = tube.pivot_height_m
     top = held + slope * (tube.height_m - pivot)
     bottom = held - pivot * slope
     for k in range(JUDGED):

@@ -5,7 +5,7 @@ import pytest
 
 from tubepose.config import ProfileConfig
 from tubepose.labware import load_rack, load_tube
-from tubepose.profile.posterior import Evidence, combine, evidence, no_evidence, pivot_m
+from tubepose.profile.posterior import Evidence, combine, evidence, no_evidence
 
 CONFIG = ProfileConfig()
 RACK = load_rack("chen2023-soft-5x10")
@@ -28,8 +28,8 @@ def posterior(*args, slot=SLOT, tube=TUBE_2, rack=RACK, **more):
 
 
 def test_a_round_bottom_is_held_at_its_centre_and_others_at_the_tip():
-    assert pivot_m(TUBE_2) == pytest.approx(13.05e-3 / 2)
-    assert pivot_m(load_tube("centrifuge-15ml-conical")) == 0.0
+    assert TUBE_2.pivot_height_m == pytest.approx(13.05e-3 / 2)
+    assert load_tube("centrifuge-15ml-conical").pivot_height_m == 0.0
 
 
 def test_evidence_by_hand():
@@ -83,7 +83,7 @@ def test_the_floors_play_bounds_a_foot_that_is_measured_farther_out():
 @pytest.mark.parametrize("sign", [-1.0, 1.0])
 def test_a_wall_bounds_a_lean_that_is_measured_too_large(axis, sign):
     room = SLOT.half_size_m[0] - float(TUBE_2.body_radius_m(RACK.depth_m))
-    limit = (room + PLAY_M) / (RACK.depth_m - pivot_m(TUBE_2))
+    limit = (room + PLAY_M) / (RACK.depth_m - TUBE_2.pivot_height_m)
     value = np.zeros(4)
     value[axis] = sign * (limit + 8e-3)
     found = posterior(value, (PLAY_M, PLAY_M, 5e-3, 5e-3))
@@ -94,7 +94,7 @@ def test_a_wall_bounds_a_lean_that_is_measured_too_large(axis, sign):
 
 def test_a_sure_lean_beyond_the_slot_is_not_allowed_and_one_within_is():
     room = SLOT.half_size_m[0] - float(TUBE_2.body_radius_m(RACK.depth_m))
-    limit = (room + PLAY_M) / (RACK.depth_m - pivot_m(TUBE_2))
+    limit = (room + PLAY_M) / (RACK.depth_m - TUBE_2.pivot_height_m)
     std = (5e-5, 5e-5, 5e-4, 5e-4)
     assert posterior((0.0, 0.0, limit + 8e-3, 0.0), std).allowed[0] < CONFIG.min_allowed
     assert posterior((0.0, 0.0, 0.5 * limit, 0.0), std).allowed[0] > 0.5
@@ -115,7 +115,7 @@ def test_a_mirrored_measurement_has_a_mirrored_answer(slot):
 def test_in_a_round_slot_all_directions_are_alike():
     tube = load_tube("blood-13x75")
     room = 6.5e-3 - float(tube.body_radius_m(ROUND_RACK.depth_m))
-    lean = (room + ROUND_RACK.floor_play_mm * 1e-3) / (ROUND_RACK.depth_m - pivot_m(tube))
+    lean = (room + ROUND_RACK.floor_play_mm * 1e-3) / (ROUND_RACK.depth_m - tube.pivot_height_m)
     std = (2e-4, 2e-4, 2e-3, 2e-3)
     lengths, shares = [], []
     for angle in np.linspace(0, np.pi / 2, 7):

@@ -6,7 +6,7 @@ import scenes
 
 from tubepose.config import ProfileConfig
 from tubepose.labware import load_rack, load_tube
-from tubepose.profile.posterior import evidence, pivot_m
+from tubepose.profile.posterior import evidence
 from tubepose.profile.standing import Standing
 from tubepose.profile.wall import wall_evidence
 
@@ -24,7 +24,7 @@ def cylinder(truth, count=1500, noise_m=3e-5, tube=TUBE, all_around=False, seed=
     rng = np.random.default_rng(seed)
     z = rng.uniform(LOW_M, RACK.floor_m + SKIRT_M - 2e-3, count)
     u, v, a, b = truth
-    above = z - RACK.floor_m - pivot_m(tube)
+    above = z - RACK.floor_m - tube.pivot_height_m
     middle = SLOT.center_m + np.column_stack([u + a * above, v + b * above])
     angle = rng.uniform(0, 2 * np.pi, count)
     normal = np.column_stack([np.cos(angle), np.sin(angle)])
@@ -54,7 +54,7 @@ def test_a_clean_wall_moves_the_axis_to_the_truth(truth, all_around):
     pose = np.zeros(4)
     for _ in range(3):
         pose = combined(told(points, pose))
-    heights = np.array([LOW_M, RACK.floor_m + SKIRT_M]) - RACK.floor_m - pivot_m(TUBE)
+    heights = np.array([LOW_M, RACK.floor_m + SKIRT_M]) - RACK.floor_m - TUBE.pivot_height_m
     off = [pose[:2] - truth[:2] + h * (pose[2:] - truth[2:]) for h in heights]
     # From one side a wider wall and a nearer axis look the same, so half the truth's radius prior stays.
     assert np.abs(off).max() < 8e-5
@@ -137,4 +137,4 @@ def test_the_surface_of_the_scenes_module_is_believed_too():
     axis = T[:3, 2] / T[2, 2]
     top = RACK.height_m + 10e-3 - RACK.floor_m
     expected = T[:2, 3] - SLOT.center_m + axis[:2] * top
-    assert pose[:2] + pose[2:] * (top - pivot_m(TUBE)) == pytest.approx(expected, abs=1e-4)
+    assert pose[:2] + pose[2:] * (top - TUBE.pivot_height_m) == pytest.approx(expected, abs=1e-4)

@@ -84,7 +84,7 @@ class GeometricDetector:
         if len(points_m) == 0:
             return np.empty(0, np.intp)
         xy = points_m[:, :2]
-        pitch_m = float(np.median(_nearest_pitch(centers_m)))
+        pitch_m = float(np.median(self.rack.pitches_m))
         radius_m = max((tube.max_radius_m for tube in self.tubes), default=pitch_m / 2)
         tops = np.zeros(len(xy), bool)
         for tube in self.tubes:
@@ -128,13 +128,6 @@ def _filled_slots(xy_m: FloatArray, centers_m: FloatArray, radius_m: float, min_
             if cv2.contourArea(hull) * 1e-6 > 0.5 * np.pi * radius_m**2:
                 filled.append(slot)
     return filled
-
-
-def _nearest_pitch(centers_m: FloatArray) -> FloatArray:
-    """Distance of every slot to its nearest neighbour, shape (S,), metres; a lone slot counts 20 mm."""
-    if len(centers_m) == 1:
-        return np.array([0.02])
-    return np.asarray(cKDTree(centers_m).query(centers_m, k=2)[0])[:, 1]
 
 
 def _cover_by_discs(xy_m: FloatArray, radius_m: float, min_points: int) -> FloatArray:

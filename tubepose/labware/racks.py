@@ -204,6 +204,16 @@ class RackModel(Definition):
         return np.array([slot.center_mm for slot in self.all_slots]) * MM
 
     @cached_property
+    def pitches_m(self) -> FloatArray:
+        """Distance of every slot's centre to the nearest other one, shape (S,), metres; a lone slot counts 20 mm."""
+        centers = self.slot_centers_m
+        if len(centers) == 1:
+            return np.array([0.02])
+        apart = np.linalg.norm(centers[:, None] - centers[None], axis=2)
+        np.fill_diagonal(apart, np.inf)
+        return np.asarray(apart.min(axis=1))
+
+    @cached_property
     def min_rib_m(self) -> float:
         """Width of the narrowest rib between two slots, metres: what a sensor must resolve to see the slots."""
         widths = [

@@ -162,6 +162,11 @@ class TubeModel(Definition):
         return self.body.height_mm * MM
 
     @property
+    def pivot_height_m(self) -> float:
+        """Height above the origin of what a slot's floor holds, metres: a round bottom's centre, or the tip."""
+        return self.body.bottom_height_mm * 1e-3 if self.body.bottom == "round" else 0.0
+
+    @property
     def max_radius_m(self) -> float:
         """Largest outer radius (the cap's where there is one), metres: the cylinder that is fitted."""
         widest = max(self.body.bottom_diameter_mm, self.body.top_diameter_mm)

@@ -15,7 +15,7 @@ from tubepose.preprocessing import TALLEST_TUBE_M
 from tubepose.profile.floor import SETTLED_MM, settle_floor
 from tubepose.profile.leftovers import Leftover, find_leftovers
 from tubepose.profile.measure import Measured, measure_tops
-from tubepose.profile.posterior import FEW_SAMPLES, Evidence, Posterior, combine, evidence, per_model, pivot_m
+from tubepose.profile.posterior import FEW_SAMPLES, Evidence, Posterior, combine, evidence, per_model
 from tubepose.profile.standing import Standing, gather_standing
 from tubepose.profile.verdict import rejection, score
 from tubepose.profile.wall import wall_evidence
@@ -120,7 +120,7 @@ def top_evidence(measured: Measured, models: Sequence[TubeModel], rack: RackMode
     """What tops say of axes: the axis through the circle's middle, along the normal but for the cap's seat."""
     count = len(models)
     centers = rack.slot_centers_m[measured.tops.slot]
-    lever = measured.level_m - rack.floor_m - per_model(models, pivot_m)
+    lever = measured.level_m - rack.floor_m - per_model(models, lambda tube: tube.pivot_height_m)
     through = np.zeros((count, 2, 4))
     through[:, [0, 1], [0, 1]] = 1.0
     through[:, [0, 1], [2, 3]] = lever[:, None]
@@ -160,7 +160,7 @@ def pose_covariance(
     shifts the bottom, and turns the axis by that shift over the distance between them.
     """
     count = len(models)
-    held = per_model(models, pivot_m)
+    held = per_model(models, lambda tube: tube.pivot_height_m)
     height = per_model(models, lambda tube: tube.height_m)
     J = np.zeros((count, 5, 4))
     J[:, 0, 3], J[:, 1, 2] = -1.0, 1.0
@@ -198,7 +198,7 @@ def _pose(
     u, v, a, b = posterior.mean[i]
     slot = rack.all_slots[measured.tops.slot[i]]
     axis = np.array([a, b, 1.0]) / np.sqrt(1 + a * a + b * b)
-    held = pivot_m(tube)
+    held = tube.pivot_height_m
     x, y = slot.center_m
     bottom = np.array([x + u, y + v, rack.floor_m + held + rise_m]) - held * axis
     tilt_std = float(np.sqrt(np.trace(covariance[:2, :2])))

@@ -64,7 +64,7 @@ def find_leftovers(
     solid = cv2.morphologyEx(solid, cv2.MORPH_OPEN, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (5, 5)))
     count, groups = cv2.connectedComponents(solid)
     of = groups[cells[:, 0], cells[:, 1]]
-    pitch = _pitch_m(rack)
+    pitch = float(rack.pitches_m.min())
     found: list[Leftover] = []
     for group in range(1, count):
         rows = rest[of == group]
@@ -109,12 +109,3 @@ def _judge(
     return Leftover(
         slot, f"unknown type: {height_m * 1e3:.1f} mm high, expected (mm): {heights}; or it stands on something", rows
     )
-
-
-def _pitch_m(rack: RackModel) -> float:
-    """Distance of the two nearest slots, metres; 20 mm for a lone slot."""
-    centers = rack.slot_centers_m
-    if len(centers) == 1:
-        return 0.02
-    apart = np.linalg.norm(centers[:, None] - centers[None], axis=2) + np.eye(len(centers))
-    return float(apart.min())

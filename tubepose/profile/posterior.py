@@ -55,11 +55,6 @@ class Posterior:
     allowed: FloatArray
 
 
-def pivot_m(tube: TubeModel) -> float:
-    """Height above a tube's origin of the point that a slot's floor holds: a round bottom's centre, or the tip."""
-    return tube.body.bottom_height_mm * 1e-3 if tube.body.bottom == "round" else 0.0
-
-
 def per_model(models: Sequence[TubeModel], value: Callable[[TubeModel], object]) -> FloatArray:
     """A value of every tube's model, computed once per model, as an array."""
     known = {id(model): model for model in models}
@@ -149,10 +144,10 @@ def _log_allowed(
     groups: dict[tuple[object, ...], list[int]] = {}
     for i, slot in enumerate(slots):
         groups.setdefault((slot.shape, slot.size_mm, slot.corner_radius_mm), []).append(i)
-    held = per_model(tubes, pivot_m)
+    held = per_model(tubes, lambda tube: tube.pivot_height_m)
     top = per_model(tubes, lambda tube: min(rack.depth_m, tube.height_m))
     radius = per_model(
-        tubes, lambda tube: tube.body_radius_m(np.array([pivot_m(tube), min(rack.depth_m, tube.height_m)]))
+        tubes, lambda tube: tube.body_radius_m(np.array([tube.pivot_height_m, min(rack.depth_m, tube.height_m)]))
     )
     for members in groups.values():
         slot = slots[members[0]]

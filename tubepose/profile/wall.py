@@ -15,12 +15,12 @@ from numpy.typing import NDArray
 
 from tubepose.config import ProfileConfig
 from tubepose.labware import RackModel, TubeModel
-from tubepose.profile.posterior import Evidence, no_evidence, per_model, pivot_m
+from tubepose.profile.posterior import Evidence, no_evidence, per_model
 from tubepose.profile.standing import Standing
 from tubepose.transforms import FloatArray
 
 PEAK = 2.0
-"""Points within this many standard deviations are the peak, those within twice to four times as many its background."""
+"""Points within this many standard deviations are the peak, those up to twice as far its background."""
 SKIRT_GAP_M = 1.0e-3
 
 
@@ -55,21 +55,19 @@ def wall_evidence(
     residual, normal, above, of = _wall_points(standing, label, pose, centers_m, tubes, rack, config)
     sigma = config.wall_noise_m
     near = np.abs(residual) < PEAK * sigma
-    beside = ~near & (np.abs(residual) < 2 * PEAK * sigma)
-    n_near, n_beside = (np.bincount(of[chosen], minlength=count) for chosen in (near, beside))
+    n_near, n_beside = (np.bincount(of[chosen], minlength=count) for chosen in (near, ~near))
     peak = np.clip((n_near - n_beside) / np.maximum(n_near, 1), 0.0, 1.0)
     weight = np.where(near, (1 - (residual / (PEAK * sigma)) ** 2) ** 2, 0.0) * (peak**2)[of]
     weight *= (n_near >= config.min_wall_points)[of] / (sigma**2 * config.wall_redundancy)
     rows = np.column_stack([-normal, -normal * above[:, None], np.ones(len(of))])
-    target = residual - np.einsum("ij,ij->i", rows[:, :4], pose[of])
+    # The residual is wanted to vanish: rows x = target; the radius, the last unknown, is marginalised.
+    target = np.einsum("ij,ij->i", rows[:, :4], pose[of]) - residual
     matrix, vector = np.zeros((count, 5, 5)), np.zeros((count, 5))
     for i in range(5):
         scaled = weight * rows[:, i]
         vector[:, i] = np.bincount(of, scaled * target, minlength=count)
         for j in range(i, 5):
             matrix[:, i, j] = matrix[:, j, i] = np.bincount(of, scaled * rows[:, j], minlength=count)
-    # residual = target + rows x = 0 is wanted: rows x = -target; the radius is marginalised.
-    vector = -vector
     matrix[:, 4, 4] += 1 / config.wall_radius_m**2
     gain = matrix[:, :4, 4] / matrix[:, 4, 4][:, None]
     return Evidence(
@@ -87,7 +85,7 @@ def _wall_points(
     config: ProfileConfig,
 ) -> tuple[FloatArray, FloatArray, FloatArray, NDArray[np.intp]]:
     """Residual, direction from the axis (N, 2), height above the held point, and tube of the points near a wall."""
-    held = per_model(tubes, pivot_m)
+    held = per_model(tubes, lambda tube: tube.pivot_height_m)
     skirt = per_model(tubes, _skirt_m) - SKIRT_GAP_M
     body = per_model(tubes, lambda tube: [tube.body.bottom_diameter_mm, tube.body.top_diameter_mm]) * 0.5e-3
     ends = per_model(tubes, lambda tube: [tube.body.bottom_height_mm, tube.body.height_mm]) * 1e-3

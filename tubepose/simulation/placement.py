@@ -115,11 +115,6 @@ def _fits(rack: RackModel, slot: SlotModel, model: TubeModel, cap: CapModel) -> 
     return widest + CLEARANCE_M < room and plate_low > rack.depth_m + 1e-3
 
 
-def pivot_height_m(model: TubeModel) -> float:
-    """Height above the tube's origin of the point that the slot's floor holds: a round bottom's centre, or the tip."""
-    return model.body.bottom_height_mm * 1e-3 if model.body.bottom == "round" else 0.0
-
-
 def lean(rack: RackModel, slot: SlotModel, model: TubeModel, rng: np.random.Generator) -> FloatArray:
     """Random T_rack_tube of shape (4, 4): the bottom within the floor's play, the body leaning as the slot allows.
 
@@ -129,7 +124,7 @@ def lean(rack: RackModel, slot: SlotModel, model: TubeModel, rng: np.random.Gene
     z, r = model.outer_profile_m().T
     inside = z <= rack.depth_m
     z, r = z[inside], r[inside]
-    pivot = pivot_height_m(model)
+    pivot = model.pivot_height_m
     above = min(rack.depth_m, model.height_m)
     room = np.maximum(slot.half_size_m - float(model.body_radius_m(above)) - CLEARANCE_M, 0.0)
     for _ in range(_LEAN_TRIES):
@@ -153,7 +148,7 @@ def _standing(
 ) -> FloatArray:
     """Pose of a tube whose lowest point touches the floor; `offset_m` (2,) is where its pivot stands off the centre."""
     axis = np.array([*slope, 1.0]) / np.sqrt(1 + slope @ slope)
-    pivot = pivot_height_m(model)
+    pivot = model.pivot_height_m
     if model.body.bottom == "round":
         height = rack.floor_m + pivot
     else:

@@ -14,7 +14,6 @@ from tubepose.capture.source import TRUTH_FOLDER
 from tubepose.errors import CaptureError
 from tubepose.labware import WallOptics
 from tubepose.labware.reading import read_yaml
-from tubepose.simulation.placement import pivot_height_m
 from tubepose.simulation.scene import CapFit, Finishes, Label, Liquid, PlacedTube, Scene
 from tubepose.transforms import FloatArray, tilt_rad
 
@@ -84,7 +83,7 @@ def as_made(tube: PlacedTube) -> TubeAsMade:
 def _entry(scene: Scene, tube: PlacedTube, name: str) -> dict[str, Any]:
     slot = scene.rack.slot(tube.slot)
     axis = tube.T_rack_tube[:3, 2]
-    pivot = tube.T_rack_tube[:3, 3] + pivot_height_m(tube.model) * axis
+    pivot = tube.T_rack_tube[:3, 3] + tube.model.pivot_height_m * axis
     return {
         "tube": name,
         "T_camera_tube": (scene.T_camera_rack @ tube.T_rack_tube).tolist(),
