@@ -27,8 +27,10 @@ def bench(
     ),
     methods: Annotated[str, typer.Option(help="Methods with commas; 'upright' is the trivial answer.")] = ALL_METHODS,
     seeds: Annotated[int, typer.Option(min=1, help="Seeds of a stochastic method: 0 to N-1.")] = 3,
-    detector: Annotated[str, typer.Option(help="Source of boxes: geometric, yolo or recorded.")] = "geometric",
-    model: Annotated[Path | None, typer.Option(help="ONNX file of --detector yolo.")] = None,
+    detector: Annotated[str, typer.Option(help="Source of boxes: yolo, geometric or recorded.")] = "yolo",
+    model: Annotated[
+        Path | None, typer.Option(help="ONNX file of --detector yolo; default: the bundled model.")
+    ] = None,
     boxes: Annotated[Path | None, typer.Option(help="Boxes of --detector recorded: YOLO txt or COCO json.")] = None,
     classes: Annotated[Path | None, typer.Option(help="Class names of the boxes or the model, one a line.")] = None,
     layout: Annotated[str | None, typer.Option(help="Output layout of the model, where it cannot be told.")] = None,

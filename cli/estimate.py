@@ -32,8 +32,10 @@ def estimate(
     method: Annotated[
         str, typer.Option(help="profile, paper, upright, slot-icp, global-icp, kiss-matcher or gicp.")
     ] = ("profile"),
-    detector: Annotated[str, typer.Option(help="Source of boxes: geometric, yolo or recorded.")] = "geometric",
-    model: Annotated[Path | None, typer.Option(help="ONNX file of --detector yolo.")] = None,
+    detector: Annotated[str, typer.Option(help="Source of boxes: yolo, geometric or recorded.")] = "yolo",
+    model: Annotated[
+        Path | None, typer.Option(help="ONNX file of --detector yolo; default: the bundled model.")
+    ] = None,
     boxes: Annotated[Path | None, typer.Option(help="Boxes of --detector recorded: YOLO txt or COCO json.")] = None,
     classes: Annotated[Path | None, typer.Option(help="Class names of the boxes or the model, one a line.")] = None,
     layout: Annotated[str | None, typer.Option(help="Output layout of the model, where it cannot be told.")] = None,

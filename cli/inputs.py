@@ -175,14 +175,15 @@ def make_detector(
 
         return lambda rack, tubes: GeometricDetector(rack, tubes, config)
     if name == "yolo":
-        if model is None:
-            raise ConfigError("--detector yolo needs --model FILE.onnx (see docs/detectors.md for how to export one)")
+        from tubepose.detection.assisted import AssistedDetector
         from tubepose.detection.box_files import read_class_names
+        from tubepose.detection.bundled import bundled_model
+        from tubepose.detection.geometric import GeometricDetector
         from tubepose.detection.yolo import YoloDetector
 
         names = read_class_names(classes) if classes is not None else None
-        yolo = YoloDetector(model, classes=names, layout=layout)
-        return lambda _rack, _tubes: yolo
+        yolo = YoloDetector(model or bundled_model(), classes=names, layout=layout)
+        return lambda rack, tubes: AssistedDetector(yolo, GeometricDetector(rack, tubes, config))
     if name == "recorded":
         if boxes is None:
             raise ConfigError("--detector recorded needs --boxes PATH (YOLO txt folder or file, or COCO json)")

@@ -9,7 +9,7 @@ import typer
 
 from tubepose import __version__
 from tubepose.errors import TubePoseError
-from tubepose_cli import data, labware
+from tubepose_cli import data, detector, labware
 from tubepose_cli.bench import bench
 from tubepose_cli.estimate import estimate
 from tubepose_cli.gt import gt
@@ -26,6 +26,7 @@ for _command in (estimate, gt, bench, simulate):
     app.command()(_command)
 app.add_typer(labware.app, name="labware")
 app.add_typer(data.app, name="data")
+app.add_typer(detector.app, name="detector")
 
 
 def _show_version(wanted: bool) -> None:

@@ -16,6 +16,7 @@ from tubepose.capture.registration import estimate_intrinsics
 from tubepose.capture.session import SlotHint
 from tubepose.config import Config
 from tubepose.detection import Detection, Detector, rows_in_box
+from tubepose.detection.assisted import AssistedDetector
 from tubepose.labware import RackModel, TubeModel
 from tubepose.preprocessing import remove_outliers
 from tubepose.profile import ProfileTube, fit_profiles
@@ -168,6 +169,10 @@ def prepare_scene(
     else:
         with clock.stage("rack"):
             rack_pose = _rack_pose(frame, rack, detections, config, hint, intrinsics)
+        if rack_pose.T_camera_rack is None and isinstance(detector, AssistedDetector):
+            detections, rack_pose = _second_opinion(
+                detector, frame, rack, detections, rack_pose, config, hint, intrinsics, clock
+            )
     targets: tuple[TubeTarget, ...] = ()
     if rack_pose.T_camera_rack is not None and any(method in TUBE_METHODS for method in methods):
         with clock.stage("slots"):
@@ -257,6 +262,12 @@ def allowed_types(scene: Scene) -> NDArray[np.bool_] | None:
     return may
 
 
+def best_rack(detections: Sequence[Detection]) -> Detection | None:
+    """The rack that is registered: the one of the best score."""
+    racks = [detection for detection in detections if detection.is_rack]
+    return max(racks, key=lambda detection: detection.score, default=None)
+
+
 def _rack_pose(
     frame: RgbdFrame,
     rack: RackModel,
@@ -265,11 +276,31 @@ def _rack_pose(
     hint: SlotHint | None,
     intrinsics: CameraIntrinsics | None,
 ) -> RackPose:
-    racks = [detection for detection in detections if detection.is_rack]
-    if not racks:
+    best = best_rack(detections)
+    if best is None:
         return RackPose(RackStatus.NOT_FOUND, "the detector found no rack")
-    best = max(racks, key=lambda detection: detection.score)
     return register_rack(frame.points_m[rows_in_box(frame, best)], rack, config, hint, intrinsics)
+
+
+def _second_opinion(
+    detector: AssistedDetector,
+    frame: RgbdFrame,
+    rack: RackModel,
+    detections: tuple[Detection, ...],
+    rack_pose: RackPose,
+    config: Config,
+    hint: SlotHint | None,
+    intrinsics: CameraIntrinsics | None,
+    clock: _Clock,
+) -> tuple[tuple[Detection, ...], RackPose]:
+    """Boxes and pose by the cloud's geometry where the network's rack has none; as they were where that fails too."""
+    if any(detection.is_rack and detection.source == "geometric" for detection in detections):
+        return detections, rack_pose
+    with clock.stage("detect"):
+        others = detector.second_opinion(frame, rack_pose.reason)
+    with clock.stage("rack"):
+        other_pose = _rack_pose(frame, rack, others, config, hint, intrinsics)
+    return (others, other_pose) if other_pose.T_camera_rack is not None else (detections, rack_pose)
 
 
 def _targets(
@@ -315,6 +346,7 @@ __all__ = [
     "TubeEstimate",
     "TubeTarget",
     "allowed_types",
+    "best_rack",
     "estimate_tubes",
     "prepare_scene",
 ]

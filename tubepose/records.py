@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from tubepose.pipeline import Scene, StageTime, TubeEstimate
+from tubepose.pipeline import Scene, StageTime, TubeEstimate, best_rack
 from tubepose.pose_errors import COVARIANCE_COLUMNS, upper_half
 from tubepose.transforms import FloatArray, quaternion_wxyz, tilt_rad
 
@@ -21,7 +21,8 @@ RACK_COVARIANCE_COLUMNS = upper_half(RACK_COVARIANCE_AXES)
 RACK_COLUMNS = (
     "session", "trial", "capture", "frame", "timestamp_ns", "method", "rack", "status", "reason", "ambiguous",
     "resolved_by", "turn_margin_m", "inlier_rmse_m", "fitness", "in_slot_share", "coverage", "spacing_m",
-    "n_tubes_detected", *POSE_COLUMNS, "named_by_margin", *RACK_COVARIANCE_COLUMNS,
+    "n_tubes_detected", "box_source", "box_score", "box_note", *POSE_COLUMNS,
+    "named_by_margin", *RACK_COVARIANCE_COLUMNS,
 )  # fmt: skip
 SLOT_COLUMNS = (
     "session",
@@ -71,7 +72,7 @@ def pose_columns(T: FloatArray | None) -> Row:
 
 def rack_row(scene: Scene) -> Row:
     """Row of racks.csv, without its keys."""
-    pose = scene.rack_pose
+    pose, box = scene.rack_pose, best_rack(scene.detections)
     return {
         "timestamp_ns": scene.frame.timestamp_ns,
         "rack": scene.rack.name,
@@ -86,6 +87,9 @@ def rack_row(scene: Scene) -> Row:
         "coverage": pose.coverage,
         "spacing_m": pose.spacing_m,
         "n_tubes_detected": sum(not detection.is_rack for detection in scene.detections),
+        "box_source": box.source if box is not None else None,
+        "box_score": box.score if box is not None else float("nan"),
+        "box_note": box.note if box is not None else "",
         **pose_columns(pose.T_camera_rack),
         **covariance_columns(pose.covariance, RACK_COVARIANCE_COLUMNS),
     }

@@ -11,6 +11,7 @@ import numpy as np
 from scipy.spatial import ConvexHull, QhullError
 
 from tubepose.config import SlotConfig
+from tubepose.detection.model import CAPPED_CLASS, OPEN_CLASS, TUBE_CLASS, visible_class
 from tubepose.labware import RackModel, SlotModel, TubeModel
 from tubepose.transforms import FloatArray
 
@@ -128,7 +129,8 @@ def identify_tube(
     """The tube model of a detection, by its class where the detector gives one, else by the height of its points.
 
     Args:
-        class_name: The detector's word; a tube model answers to its name and to its `classes`.
+        class_name: The detector's word; a tube model answers to its name, to its `classes`, and to whether it is
+            capped or open.
         points_m: The tube's points, rack frame, shape (N, 3), metres.
         candidates: The tubes that can be in this rack.
         rack: For the floor that the tube stands on.
@@ -140,7 +142,11 @@ def identify_tube(
     named = [tube for tube in candidates if class_name == tube.name or class_name in tube.classes]
     if named:
         return named[0], ""
-    if class_name != "tube":
+    if class_name in (CAPPED_CLASS, OPEN_CLASS):
+        seen = [tube for tube in candidates if visible_class(closed=not tube.is_open) == class_name]
+        # A cap is easily taken for an opening from above: where no such tube is there, height alone decides.
+        candidates = seen or candidates
+    elif class_name != TUBE_CLASS:
         known = sorted({word for tube in candidates for word in (tube.name, *tube.classes)})
         return None, f"class '{class_name}' belongs to none of the tubes given (they answer to {', '.join(known)})"
     height_m = float(np.percentile(points_m[:, 2], 95)) - rack.floor_m

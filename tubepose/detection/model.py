@@ -12,6 +12,14 @@ from tubepose.capture.frame import RgbdFrame
 
 RACK_CLASS = "rack"
 TUBE_CLASS = "tube"
+CAPPED_CLASS = "tube-capped"
+OPEN_CLASS = "tube-open"
+"""What can be seen of a tube of any make; the bundled network knows these two and `RACK_CLASS`."""
+
+
+def visible_class(*, closed: bool) -> str:
+    """What can be seen of a tube: the class of one that is closed by a cap, or of one that is open."""
+    return CAPPED_CLASS if closed else OPEN_CLASS
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -25,6 +33,7 @@ class Detection:
         source: ``yolo``, ``recorded`` or ``geometric``.
         point_rows: Rows of `RgbdFrame.points_m` that belong to the object, where the detector knows them (geometric);
             None means every point in the box.
+        note: Why another source than the one that was asked for found it; empty otherwise.
     """
 
     class_name: str
@@ -32,6 +41,7 @@ class Detection:
     box_xyxy_px: tuple[float, float, float, float]
     source: str
     point_rows: NDArray[np.intp] | None = None
+    note: str = ""
 
     @property
     def is_rack(self) -> bool:

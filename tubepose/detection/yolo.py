@@ -82,6 +82,11 @@ class YoloDetector:
         self.classes: tuple[str, ...] = names or ()
         self._words = class_words(self.classes, class_map, str(model))
 
+    @property
+    def words(self) -> tuple[str, ...]:
+        """What its detections can carry, by the numbers of `classes`."""
+        return self._words
+
     def detect(self, frame: RgbdFrame) -> tuple[Detection, ...]:
         """Find racks and tubes in the frame's image, best score first.
 
@@ -93,7 +98,18 @@ class YoloDetector:
                 f"{frame.capture} frame {frame.index}: no image, but a YOLO model needs one; "
                 "use the geometric detector or recorded boxes"
             )
-        image = to_8bit_rgb(frame.image)
+        return self.detect_image(frame.image)
+
+    def detect_image(self, image: NDArray[np.generic]) -> tuple[Detection, ...]:
+        """Find racks and tubes in a picture, best score first.
+
+        Args:
+            image: Gray (H, W) or RGB (H, W, 3), of any depth.
+
+        Raises:
+            DetectorError: The picture is empty, or the network's values make no sense.
+        """
+        image = to_8bit_rgb(image)
         size = (image.shape[1], image.shape[0])
         yolox = self.layout.startswith("yolox")
         letterbox = fit_letterbox(size, self.net_size, centred=not yolox)

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from tubepose.pipeline import Scene, TubeEstimate
+from tubepose.pipeline import Scene, TubeEstimate, best_rack
 from tubepose.transforms import FloatArray, transform_points
 from tubepose.tube import TubeStatus
 
@@ -38,9 +38,13 @@ def draw_overlay(scene: Scene, estimates: Sequence[TubeEstimate]) -> Picture:
     picture, project = _background(scene)
     if isinstance(project, _ImageView):
         for detection in scene.detections:
-            if np.isfinite(detection.box_xyxy_px).all() and not detection.is_rack:
+            if np.isfinite(detection.box_xyxy_px).all() and (not detection.is_rack or detection.source != "geometric"):
                 left_top, right_bottom = (project.pixel(detection.box_xyxy_px[i : i + 2]) for i in (0, 2))
-                cv2.rectangle(picture, left_top, right_bottom, _BOX_BGR, 1, cv2.LINE_AA)
+                color = _RACK_BGR if detection.is_rack else _BOX_BGR
+                cv2.rectangle(picture, left_top, right_bottom, color, 1, cv2.LINE_AA)
+                if detection.source == "yolo":
+                    place = (left_top[0] + 2, max(left_top[1] + 12, 12))
+                    _text(picture, f"{detection.score:.2f}", place, 0.38, color)
     _draw_rack(picture, scene, project)
     for estimate in estimates:
         if estimate.T_camera_tube is not None:
@@ -207,6 +211,9 @@ def _legend(width: int, scene: Scene, estimates: Sequence[TubeEstimate]) -> Pict
     counts = {status: sum(e.pose.status.value == status for e in estimates) for status in COLORS_BGR}
     kind = "SIMULATED" if scene.frame.simulated else "recorded"
     lines = [(f"{scene.frame.capture} frame {scene.frame.index} ({kind})", _TEXT_BGR)]
+    box = best_rack(scene.detections)
+    if box is not None and box.note:
+        rack += f"; boxes by the geometric detector: {box.note}"
     lines += [(part, _RACK_BGR) for part in textwrap.wrap(rack, max(20, width // 11))]
     strip = np.full((24 * (len(lines) + 1) + 12, width, 3), 30, np.uint8)
     for i, (text, color) in enumerate(lines):

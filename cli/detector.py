@@ -1,0 +1,207 @@
+"""`tubepose detector`: labelled pictures by rendering, training, and judging detectors."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+import typer
+
+if TYPE_CHECKING:
+    from tubepose.detection.evaluation import DetectionReport
+    from tubepose.training.scenes import Labware
+
+app = typer.Typer(help="Detectors that learn from labware files alone, and how good they are.", no_args_is_help=True)
+CATALOGUE = "catalogue"
+SUMMARY_FILE, SUCCESS_FILE, WORST_FILE = "detection_summary.csv", "detection_success.csv", "worst.png"
+_UNSEEN_SEED = 1_000_003
+"""Added to a seed for pictures to judge by."""
+
+
+@app.command()
+def render(
+    out: Annotated[Path, typer.Option(help="Folder for the pictures and labels; one that was cut off goes on.")],
+    labware: Annotated[
+        str, typer.Option(help="Racks, tubes and printed caps: names or files, with commas; or catalogue.")
+    ] = CATALOGUE,
+    count: Annotated[int, typer.Option(min=1, help="Pictures in all.")] = 100,
+    seed: Annotated[int, typer.Option(min=0, help="The same seed gives the same pictures.")] = 0,
+    side: Annotated[int, typer.Option(min=96, max=2064, help="Longer side of the pictures, pixels.")] = 640,
+    variants: Annotated[float, typer.Option(min=0, max=1, help="Share of random variants of the labware.")] = 0.5,
+    view: Annotated[
+        Literal["any", "scanner"], typer.Option(help="any: from anywhere. scanner: one rack, from above.")
+    ] = "any",
+    held_out: Annotated[bool, typer.Option("--held-out", help="Grounds that no training picture has.")] = False,
+    threads: Annotated[int, typer.Option(min=0, help="0: one per core. They change no picture.")] = 0,
+) -> None:
+    """Render SIMULATED pictures with exact boxes, as YOLO label files."""
+    from dataclasses import replace
+
+    from tubepose.training.images import ImageSet, write_images
+    from tubepose_cli.show import counted_progress, say
+    from tubepose_cli.simulate import available_cores
+
+    drawn = replace(read_labware_list(labware), variants=variants, held_out=held_out)
+    with counted_progress("pictures") as show:
+        source = ImageSet(drawn, seed, side, view)
+        write_images(out, source, count, threads=threads or available_cores(), on_done=lambda done: show(done, count))
+    say(f"{out}: {count} rendered pictures with labels")
+
+
+@app.command()
+def train(
+    out: Annotated[Path, typer.Option(help="The .onnx file to write.")],
+    labware: Annotated[
+        str, typer.Option(help="Racks, tubes and printed caps: names or files, with commas; or catalogue.")
+    ] = CATALOGUE,
+    pictures: Annotated[int, typer.Option(min=1, help="Pictures to render and learn from.")] = 2000,
+    steps: Annotated[int, typer.Option(min=1, help="Batches to learn from.")] = 4000,
+    batch: Annotated[int, typer.Option(min=1, help="Samples a batch.")] = 8,
+    sample_side: Annotated[int, typer.Option(min=96, help="Side of a training sample, pixels.")] = 384,
+    late_side: Annotated[int, typer.Option(min=96, help="Its side in the last fifth of the training.")] = 544,
+    side: Annotated[int, typer.Option(min=96, help="Side of the model's input, and of the pictures.")] = 640,
+    variants: Annotated[float, typer.Option(min=0, max=1, help="Share of random variants of the labware.")] = 0.5,
+    view: Annotated[
+        Literal["any", "scanner"], typer.Option(help="any: from anywhere. scanner: one rack, from above.")
+    ] = "any",
+    seed: Annotated[int, typer.Option(min=0, help="Of the pictures and of the training.")] = 0,
+    images: Annotated[
+        Path | None, typer.Option(help="Learn from this set (images/, labels/, classes.txt) and render none.")
+    ] = None,
+    unseen: Annotated[int, typer.Option(min=0, help="Further pictures to judge the model by; 0 for none.")] = 60,
+    work: Annotated[Path | None, typer.Option(help="Folder of pictures and checkpoint; default: beside --out.")] = None,
+    threads: Annotated[int, typer.Option(min=0, help="0: one per core.")] = 0,
+) -> None:
+    """Train a detector from labware files alone, on rendered pictures. A training that was cut off goes on."""
+    from dataclasses import replace
+
+    from tubepose.detection.labelled_images import labelled_set
+    from tubepose.errors import ConfigError
+    from tubepose.training.images import ImageSet, write_images
+    from tubepose.training.loop import Recipe
+    from tubepose.training.network import require_packages
+    from tubepose.training.train import LOSS_FILE, SAMPLES_FILE, TrainingJob, train_detector
+    from tubepose_cli.show import counted_progress, say
+    from tubepose_cli.simulate import available_cores
+
+    if out.suffix != ".onnx":
+        raise ConfigError(f"--out {out}: expected a name that ends in .onnx")
+    require_packages()
+    cores = threads or available_cores()
+    folder = work if work is not None else out.with_name(f"{out.stem}-training")
+    drawn = replace(read_labware_list(labware), variants=variants)
+    recipe = Recipe(steps=steps, batch=batch, side_px=sample_side, late_side_px=late_side, seed=seed)
+    sets = [(folder / "pictures", ImageSet(drawn, seed, side, view), pictures)] if images is None else []
+    if unseen:
+        judged = ImageSet(replace(drawn, held_out=True), seed + _UNSEEN_SEED, side, view)
+        sets.append((folder / "unseen", judged, unseen))
+    for place, source, count in sets:
+        with counted_progress("pictures") as show:
+            write_images(place, source, count, threads=cores, on_done=lambda done: show(done, count))  # noqa: B023
+    files = labelled_set(images if images is not None else folder / "pictures")
+    job = TrainingJob(files, out, folder, recipe, side, cores)
+    with counted_progress("steps") as show:
+        report = train_detector(
+            job, labelled_set(folder / "unseen") if unseen else None, lambda done, _loss: show(done, steps)
+        )
+    say(f"{out}: {steps} steps on {len(files.images)} pictures; {folder / LOSS_FILE} shows the loss")
+    if report is not None:
+        show_report(report, f"{unseen} pictures on unseen grounds ({folder / SAMPLES_FILE})")
+
+
+@app.command()
+def evaluate(
+    images: Annotated[Path, typer.Option(help="Folder of pictures.")],
+    labels: Annotated[Path, typer.Option(help="Folder of YOLO label files, NAME.txt for NAME.jpg.")],
+    classes: Annotated[Path, typer.Option(help="Class names of the labels, one a line.")],
+    out: Annotated[Path, typer.Option(help="Folder for the results.")],
+    model: Annotated[Path | None, typer.Option(help="ONNX file; default: the bundled model.")] = None,
+    model_classes: Annotated[Path | None, typer.Option(help="Class names of a model that names none.")] = None,
+    map_: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--map", metavar="NAME=tube|rack|ignore", help="What a class of the labels is, else its name says."
+        ),
+    ] = None,
+    score: Annotated[float, typer.Option(min=0, max=1, help="Score from which a box is an answer.")] = 0.3,
+    threads: Annotated[int, typer.Option(min=0, help="0: onnxruntime's choice.")] = 0,
+) -> None:
+    """Judge a detector by labelled pictures: detection_summary.csv, detection_success.csv, worst.png."""
+    import cv2
+    import pandas as pd
+
+    from tubepose.detection.box_files import read_class_names
+    from tubepose.detection.bundled import bundled_model
+    from tubepose.detection.evaluation import evaluate_detector, kinds_of
+    from tubepose.detection.labelled_images import find_labelled
+    from tubepose.detection.yolo import YoloDetector
+    from tubepose.report import write_aside, write_csv
+    from tubepose.training.pictures import worst_sheet
+    from tubepose.training.train import LOW_SCORE
+    from tubepose_cli.show import counted_progress, say
+
+    files = find_labelled(images, labels, classes)
+    kinds = kinds_of(files.classes, _pairs(map_ or []))
+    names = read_class_names(model_classes) if model_classes is not None else None
+    detector = YoloDetector(model or bundled_model(), classes=names, score_threshold=LOW_SCORE, threads=threads or None)
+    with counted_progress("pictures") as show:
+        report = evaluate_detector(
+            detector.detect_image, detector.words, files, kinds, score, lambda done: show(done, len(files.images))
+        )
+    write_csv(out / SUMMARY_FILE, report.summary)
+    success = {"frames": report.n_frames, "successes": report.n_success, "success_rate": report.success_rate}
+    write_csv(out / SUCCESS_FILE, pd.DataFrame([success]))
+    with write_aside(out / WORST_FILE) as aside:
+        cv2.imwrite(str(aside), worst_sheet(files, report, kinds, score))
+    show_report(report, f"{len(files.images)} pictures, score {score:g} or more, overlap 0.5")
+    say(f"{out}: {SUMMARY_FILE}, {SUCCESS_FILE}, {WORST_FILE}")
+
+
+def show_report(report: DetectionReport, title: str) -> None:
+    """The summary as a table, with the success rate under it."""
+    from tubepose_cli.show import show_table
+
+    table = report.summary.copy()
+    for name in ("precision", "recall", "ap50", "ap50_95"):
+        table[name] = [f"{value:.3f}" if value == value else "" for value in table[name]]
+    note = f"all labelled tubes and racks found with the right class: {report.n_success} of {report.n_frames} pictures"
+    show_table(table, title, [note])
+
+
+def _pairs(given: Sequence[str]) -> dict[str, str]:
+    from tubepose.errors import ConfigError
+
+    pairs = {}
+    for text in given:
+        name, equals, kind = text.partition("=")
+        if not equals:
+            raise ConfigError(f"--map {text}: expected NAME=tube, NAME=rack or NAME=ignore")
+        pairs[name.strip()] = kind.strip()
+    return pairs
+
+
+def read_labware_list(names: str) -> Labware:
+    """Racks, tubes and printed caps of a comma-separated list of names and files, or of the whole catalogue."""
+    from tubepose.errors import LabwareError
+    from tubepose.labware import CapModel, RackModel, TubeModel, catalogue, read_labware
+    from tubepose.training.scenes import Labware
+    from tubepose_cli.inputs import unknown_name
+
+    known = catalogue()
+    found: list[CapModel | RackModel | TubeModel] = []
+    for name in (text.strip() for text in names.split(",")):
+        if name == CATALOGUE:
+            found += known.values()
+        elif name in known:
+            found.append(known[name])
+        elif Path(name).suffix in (".yaml", ".yml"):
+            found.append(read_labware(Path(name)))
+        elif name:
+            raise LabwareError(unknown_name("labware", name, known) + "; or give a .yaml file")
+    racks = tuple(item for item in found if isinstance(item, RackModel))
+    tubes = tuple(item for item in found if isinstance(item, TubeModel))
+    caps = tuple(item for item in found if isinstance(item, CapModel))
+    if not racks or not tubes:
+        raise LabwareError(f"--labware {names}: found {len(racks)} racks and {len(tubes)} tubes, expected one of each")
+    return Labware(racks, tubes, caps)

@@ -1,0 +1,133 @@
+"""Samples for training: random crops of pictures at random scales, and several pictures in one."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from tubepose.detection.labelled_images import LabelledFiles
+from tubepose.transforms import FloatArray
+
+Image = NDArray[np.uint8]
+BORDER = 114
+"""Gray of what lies beyond a picture, as all YOLO families have it."""
+_KEPT_SHARE = 0.25
+"""A box of which a crop leaves less than this is dropped."""
+_MIN_SIDE_PX = 4.0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Sample:
+    """A picture and its boxes.
+
+    Attributes:
+        image: 8-bit RGB, shape (H, W, 3).
+        class_ids: Array of shape (N,).
+        edges_xyxy: Array of shape (N, 4): left, top, right, bottom, pixels.
+    """
+
+    image: Image
+    class_ids: NDArray[np.intp]
+    edges_xyxy: FloatArray
+
+
+def draw_sample(files: LabelledFiles, side_px: int, mosaic_share: float, rng: np.random.Generator) -> Sample:
+    """A square sample: a crop of one picture, or four crops of four pictures side by side.
+
+    Args:
+        files: Where to draw from.
+        side_px: Side of the sample.
+        mosaic_share: Chance of four pictures.
+        rng: Source of randomness.
+    """
+    if rng.uniform() >= mosaic_share:
+        return look_other(_crop(_read(files, rng), (side_px, side_px), rng), rng)
+    at_x, at_y = (round(side_px * value) for value in rng.uniform(0.3, 0.7, 2))
+    canvas = np.full((side_px, side_px, 3), BORDER, np.uint8)
+    ids, edges = [], []
+    for x0, x1 in ((0, at_x), (at_x, side_px)):
+        for y0, y1 in ((0, at_y), (at_y, side_px)):
+            tile = _crop(_read(files, rng), (x1 - x0, y1 - y0), rng)
+            canvas[y0:y1, x0:x1] = tile.image
+            ids.append(tile.class_ids)
+            edges.append(tile.edges_xyxy + np.array([x0, y0, x0, y0]))
+    return look_other(Sample(canvas, np.concatenate(ids), np.concatenate(edges)), rng)
+
+
+def _read(files: LabelledFiles, rng: np.random.Generator) -> Sample:
+    number = int(rng.integers(len(files.images)))
+    image = files.read_image(number)
+    ids, edges = files.read_boxes(number, (image.shape[1], image.shape[0]))
+    return Sample(image, ids, edges)
+
+
+def _crop(sample: Sample, size: tuple[int, int], rng: np.random.Generator) -> Sample:
+    """A part of a picture at a random scale and maybe turned by quarters or mirrored, of a given width and height."""
+    sample = _turned(sample, rng)
+    height, width = sample.image.shape[:2]
+    scale = float(np.exp(rng.uniform(np.log(0.5), np.log(1.4))))
+    if rng.uniform() < 0.25:  # the whole picture, so that large things are seen whole
+        scale = min(scale, max(size) / max(width, height))
+    squeeze = float(np.exp(rng.normal(0.0, 0.06)))
+    scales = np.array([scale * squeeze, scale / squeeze])
+    free = np.array([width, height]) * scales - np.array(size)
+    middle = rng.uniform(0.0, 1.0, 2) * free
+    if len(sample.edges_xyxy) and rng.uniform() < 0.7:  # around some object
+        box = sample.edges_xyxy[int(rng.integers(len(sample.edges_xyxy)))].reshape(2, 2).mean(axis=0)
+        middle = np.clip(box * scales - rng.uniform(0.1, 0.9, 2) * size, np.minimum(free, 0), np.maximum(free, 0))
+    matrix = np.array([[scales[0], 0, -middle[0]], [0, scales[1], -middle[1]]])
+    source = sample.image
+    if scale < 0.8:  # a picture that is warped down without this gets jagged edges
+        source = np.asarray(cv2.GaussianBlur(source, (0, 0), 0.35 / scale), np.uint8)
+    image = cv2.warpAffine(source, matrix, size, flags=cv2.INTER_LINEAR, borderValue=(BORDER,) * 3)
+    edges = sample.edges_xyxy * np.tile(scales, 2) - np.tile(middle, 2)
+    return _cut(Sample(np.asarray(image, np.uint8), sample.class_ids, edges), size)
+
+
+def _cut(sample: Sample, size: tuple[int, int]) -> Sample:
+    """Boxes cut at the border; those of which little is left are dropped."""
+    edges = sample.edges_xyxy
+    clipped = np.clip(edges, 0, np.tile(size, 2))
+    sides, whole = clipped[:, 2:] - clipped[:, :2], edges[:, 2:] - edges[:, :2]
+    kept = (sides.min(axis=1, initial=np.inf) >= _MIN_SIDE_PX) & (
+        sides.prod(axis=1) >= _KEPT_SHARE * np.maximum(whole.prod(axis=1), 1e-9)
+    )
+    return Sample(sample.image, sample.class_ids[kept], clipped[kept])
+
+
+def _turned(sample: Sample, rng: np.random.Generator) -> Sample:
+    image, edges = sample.image, sample.edges_xyxy
+    if rng.uniform() < 0.5:
+        image = image[:, ::-1]
+        edges = np.column_stack([image.shape[1] - edges[:, 2], edges[:, 1], image.shape[1] - edges[:, 0], edges[:, 3]])
+    if rng.uniform() < 0.25:
+        for _ in range(int(rng.integers(1, 4))):
+            image = np.rot90(image)
+            height = image.shape[0]
+            edges = np.column_stack([edges[:, 1], height - edges[:, 2], edges[:, 3], height - edges[:, 0]])
+    return Sample(np.ascontiguousarray(image), sample.class_ids, edges.reshape(-1, 4))
+
+
+def look_other(sample: Sample, rng: np.random.Generator) -> Sample:
+    """The same boxes under other colours, contrast, blur and noise."""
+    light = sample.image.astype(np.float32) / np.float32(255)
+    if rng.uniform() < 0.5:
+        hsv = cv2.cvtColor(light, cv2.COLOR_RGB2HSV)
+        widest = 30 if rng.uniform() < 0.7 else 180
+        hsv[..., 0] = np.mod(hsv[..., 0] + np.float32(rng.uniform(-widest, widest)), 360)
+        hsv[..., 1] = np.clip(hsv[..., 1] * np.float32(rng.uniform(0.3, 1.5)), 0, 1)
+        light = np.asarray(cv2.cvtColor(hsv, cv2.COLOR_HSV2RGB), np.float32)
+    if rng.uniform() < 0.25:
+        light = np.repeat(light @ rng.dirichlet(np.ones(3)).astype(np.float32)[:, None], 3, axis=2)
+    if rng.uniform() < 0.6:
+        light = np.clip(light, 0, 1) ** np.float32(np.exp(rng.normal(0, 0.3)))
+        light = (light - 0.5) * np.float32(rng.uniform(0.6, 1.4)) + np.float32(0.5 + rng.normal(0, 0.1))
+    if rng.uniform() < 0.15:
+        light = np.asarray(cv2.GaussianBlur(light, (0, 0), float(rng.uniform(0.4, 1.5))), np.float32)
+    if rng.uniform() < 0.2:
+        light = light + rng.normal(0, rng.uniform(0.005, 0.04), (*light.shape[:2], 1)).astype(np.float32)
+    image = np.round(np.clip(light, 0, 1) * 255).astype(np.uint8)
+    return Sample(image, sample.class_ids, sample.edges_xyxy)
