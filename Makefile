@@ -1,9 +1,9 @@
-# make demo | test | check | bench | clean. The first call sets up .venv (setup.sh); nothing else is installed by hand.
+# make demo | test | check | train-test | bench | clean. The first call sets up .venv (setup.sh); nothing else is installed by hand.
 PYTHON ?=
 BIN := .venv/bin
 JOBS ?= 2
 
-.PHONY: setup demo test lint wheel check bench clean
+.PHONY: setup demo test lint wheel check train-test bench clean
 
 setup: .venv/.ready
 
@@ -32,6 +32,15 @@ wheel: .venv/.ready
 	cd out/wheel && venv/bin/tubepose bench --methods upright --out bench
 
 check: lint test wheel
+
+# What needs the extra `train` (PyTorch, some GB), in an environment of its own: a few minutes.
+train-test: .venv-train/.ready
+	.venv-train/bin/python -m pytest tests/test_training_loop.py
+
+.venv-train/.ready: .venv/.ready
+	[ -x .venv-train/bin/python ] || $(BIN)/python -m venv .venv-train
+	.venv-train/bin/python -m pip install --quiet --upgrade --editable ".[dev,train]"
+	touch .venv-train/.ready
 
 # The tables of benchmarks/README.md; BENCH_ARGS names sessions and options.
 bench: .venv/.ready

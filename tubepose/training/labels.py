@@ -39,8 +39,14 @@ class Label:
     inside: float
 
 
-def label_objects(scene: LearningScene, rendered: Rendered) -> list[Label]:
-    """Labels of all objects of which enough can be seen, in the scene's order."""
+def label_objects(scene: LearningScene, rendered: Rendered, least_visible: float = MIN_VISIBLE) -> list[Label]:
+    """Labels of all objects of which enough can be seen, in the scene's order.
+
+    Args:
+        scene: What was rendered.
+        rendered: Which pixel shows what.
+        least_visible: Share of its outline in the picture that must be seen of an object.
+    """
     masks = _visible(scene, rendered)
     labels = []
     for found, mask in zip(scene.objects, masks, strict=True):
@@ -52,7 +58,7 @@ def label_objects(scene: LearningScene, rendered: Rendered) -> list[Label]:
         whole, inside = _outline_px(found, scene.intrinsics)
         visible, share = min(1.0, pixels / max(inside, 1.0)), inside / max(whole, 1.0)
         large = min(box[2] - box[0], box[3] - box[1]) >= MIN_SIDE_PX
-        if large and visible >= MIN_VISIBLE and share >= MIN_INSIDE:
+        if large and visible >= least_visible and share >= MIN_INSIDE:
             labels.append(Label(found.class_name, box, visible, share))
     return labels
 

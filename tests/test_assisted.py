@@ -1,0 +1,119 @@
+"""The network's boxes with the geometric detector at its side, and what the results say of it."""
+
+import re
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pytest
+import scenes
+from test_pipeline import CONFIG, PLACED, RACK, T_CAMERA_RACK, TUBES, frame_of, hint_for
+
+from tubepose.detection import Detection
+from tubepose.detection.assisted import AssistedDetector
+from tubepose.detection.geometric import GeometricDetector
+from tubepose.detection.model import CAPPED_CLASS, OPEN_CLASS
+from tubepose.pipeline import best_rack, prepare_scene
+from tubepose.rack import RackStatus
+from tubepose.records import rack_row
+from tubepose.slots import identify_tube
+from tubepose.transforms import transform_points
+
+WHOLE = (0.0, 0.0, 639.0, 479.0)
+CORNER = (0.0, 0.0, 20.0, 20.0)
+
+
+@dataclass
+class Network:
+    """A network that says what it is told to, and counts how often it is asked."""
+
+    found: tuple[Detection, ...]
+    asked: int = 0
+
+    def detect(self, _frame):
+        self.asked += 1
+        return self.found
+
+
+@pytest.fixture(scope="module")
+def frame():
+    plain = frame_of(organised=True)
+    return replace(plain, image=np.zeros(plain.cloud_m.shape[:2], np.uint8), intrinsics=scenes.CAMERA)
+
+
+def rack_box(score, box=WHOLE):
+    return Detection("rack", score, box, "yolo")
+
+
+def assisted(*found):
+    return AssistedDetector(Network(tuple(found)), GeometricDetector(RACK, TUBES, CONFIG))
+
+
+def test_a_network_that_is_sure_of_the_rack_is_alone(frame):
+    tube = Detection(CAPPED_CLASS, 0.9, (10.0, 10.0, 20.0, 20.0), "yolo")
+    rack = rack_box(0.8)
+    assert assisted(rack, tube).detect(frame) == (rack, tube)
+
+
+@pytest.mark.parametrize(
+    ("found", "why"),
+    [((), "the network saw no rack"), ((rack_box(0.4),), r"the network was unsure of the rack \(0.40\)")],
+)
+def test_the_cloud_helps_where_the_network_sees_no_rack_or_is_unsure(frame, found, why):
+    helped = assisted(*found).detect(frame)
+    assert {detection.source for detection in helped} == {"geometric"}
+    assert len(helped) == 1 + len(PLACED)
+    for detection in helped:
+        assert re.fullmatch(why, detection.note)
+
+
+def test_a_frame_without_an_image_is_not_shown_to_the_network(frame):
+    detector = assisted(rack_box(0.9))
+    helped = detector.detect(replace(frame, image=None))
+    assert detector.yolo.asked == 0
+    assert {detection.note for detection in helped} == {"the frame has no image for the network"}
+
+
+def test_an_unsure_box_stays_where_the_cloud_has_no_rack_at_all(frame):
+    empty = replace(frame, cloud_m=np.full_like(frame.cloud_m, np.nan))
+    rack = rack_box(0.4)
+    assert assisted(rack).detect(empty) == (rack,)
+
+
+def test_a_wrong_box_of_the_network_gets_a_second_opinion_and_the_row_says_so(frame):
+    detector = assisted(rack_box(0.9, CORNER))
+    scene = prepare_scene(frame, RACK, TUBES, detector, CONFIG, hint_for(T_CAMERA_RACK))
+    assert scene.rack_pose.status is RackStatus.OK
+    row = rack_row(scene)
+    assert row["box_source"] == "geometric"
+    assert row["box_note"].startswith("no rack in the network's box")
+    assert np.allclose(
+        transform_points(scene.rack_pose.T_camera_rack, np.zeros((1, 3))), T_CAMERA_RACK[:3, 3], atol=1e-3
+    )
+    assert sorted(target.slot for target in scene.targets) == sorted(PLACED)
+
+
+def test_where_the_cloud_does_not_help_either_the_first_answer_stays(frame):
+    cloud = frame.cloud_m.copy()
+    cloud[100:] = np.nan  # what is left is no rack
+    rack = rack_box(0.9, CORNER)
+    scene = prepare_scene(replace(frame, cloud_m=cloud), RACK, TUBES, assisted(rack), CONFIG)
+    assert scene.rack_pose.T_camera_rack is None
+    assert best_rack(scene.detections) is rack
+    assert rack_row(scene)["box_score"] == 0.9
+
+
+def test_what_is_seen_of_a_tube_narrows_its_types_down():
+    def points(tube):
+        return np.tile([0.0, 0.0, RACK.floor_m + tube.height_m], (50, 1))
+
+    closed = [tube for tube in TUBES if not tube.is_open]
+    opened = [tube for tube in TUBES if tube.is_open]
+    assert identify_tube(OPEN_CLASS, points(opened[0]), TUBES, RACK, CONFIG.slots)[0] == opened[0]
+    for tube in closed:
+        assert identify_tube(CAPPED_CLASS, points(tube), TUBES, RACK, CONFIG.slots)[0] == tube
+    # As high as an open one, but seen to be capped.
+    found, reason = identify_tube(CAPPED_CLASS, points(opened[0]), TUBES, RACK, CONFIG.slots)
+    assert found != opened[0]
+    assert found is not None or "unknown type" in reason
+    # A cap is easily taken for an opening: with no open type at hand, height decides alone.
+    assert identify_tube(OPEN_CLASS, points(closed[0]), closed[:1], RACK, CONFIG.slots)[0] == closed[0]

