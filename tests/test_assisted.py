@@ -8,12 +8,14 @@ import pytest
 import scenes
 from test_pipeline import CONFIG, PLACED, RACK, T_CAMERA_RACK, TUBES, frame_of, hint_for
 
-from tubepose.detection import Detection
+from tubepose import pipeline
+from tubepose.capture.frame import RgbdFrame
+from tubepose.detection import Detection, rows_in_box
 from tubepose.detection.assisted import AssistedDetector
 from tubepose.detection.geometric import GeometricDetector
 from tubepose.detection.model import CAPPED_CLASS, OPEN_CLASS
 from tubepose.pipeline import best_rack, prepare_scene
-from tubepose.rack import RackStatus
+from tubepose.rack import RackPose, RackStatus
 from tubepose.records import rack_row
 from tubepose.slots import identify_tube
 from tubepose.transforms import transform_points
@@ -117,3 +119,22 @@ def test_what_is_seen_of_a_tube_narrows_its_types_down():
     assert found is not None or "unknown type" in reason
     # A cap is easily taken for an opening: with no open type at hand, height decides alone.
     assert identify_tube(OPEN_CLASS, points(closed[0]), closed[:1], RACK, CONFIG.slots)[0] == closed[0]
+
+
+def test_a_margin_takes_the_points_around_a_box_in():
+    cloud = np.ones((20, 30, 3))
+    frame = RgbdFrame(cloud, None, None, None, "plain")
+    box = Detection("rack", 1.0, (5.0, 4.0, 14.0, 9.0), "recorded")
+    assert len(rows_in_box(frame, box)) == 10 * 6
+    assert len(rows_in_box(frame, box, 0.2)) == 14 * 10  # 1.8 pixels more on every side
+
+
+def test_a_rack_is_looked_for_in_a_little_more_than_its_box(frame, monkeypatch):
+    taken = []
+    monkeypatch.setattr(
+        pipeline, "register_rack", lambda points, *_: taken.append(len(points)) or RackPose(RackStatus.REFUSED)
+    )
+    for margin in (0.0, pipeline.RACK_MARGIN):
+        monkeypatch.setattr(pipeline, "RACK_MARGIN", margin)
+        prepare_scene(frame, RACK, TUBES, Network((rack_box(0.9, (200.0, 150.0, 400.0, 300.0)),)), CONFIG)
+    assert taken[1] > 1.1 * taken[0] > 0

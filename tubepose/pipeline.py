@@ -38,6 +38,8 @@ TUBE_METHODS: Mapping[str, TubeMethod] = {
 DEFAULT_METHOD = "profile"
 METHODS = (DEFAULT_METHOD, *TUBE_METHODS)
 """All methods; `profile` looks at the whole frame, and finds its tubes and their slots itself."""
+RACK_MARGIN = 0.05
+"""A rack is looked for in a little more than its box: a box that is drawn too tight cuts its edges off."""
 STOCHASTIC = frozenset({"global-icp", "kiss-matcher"})
 
 
@@ -279,7 +281,7 @@ def _rack_pose(
     best = best_rack(detections)
     if best is None:
         return RackPose(RackStatus.NOT_FOUND, "the detector found no rack")
-    return register_rack(frame.points_m[rows_in_box(frame, best)], rack, config, hint, intrinsics)
+    return register_rack(frame.points_m[rows_in_box(frame, best, RACK_MARGIN)], rack, config, hint, intrinsics)
 
 
 def _second_opinion(

@@ -66,12 +66,20 @@ class Detector(Protocol):
         ...
 
 
-def rows_in_box(frame: RgbdFrame, detection: Detection) -> NDArray[np.intp]:
-    """Rows of `RgbdFrame.points_m` that a detection selects, valid points only."""
+def rows_in_box(frame: RgbdFrame, detection: Detection, margin: float = 0.0) -> NDArray[np.intp]:
+    """Rows of `RgbdFrame.points_m` that a detection selects, valid points only.
+
+    Args:
+        frame: The frame.
+        detection: What selects.
+        margin: By how much the box is wider on every side, as a share of its longer side; nothing for `point_rows`.
+    """
     if detection.point_rows is not None:
         return _valid_rows(frame, detection.point_rows)
     height, width = frame.cloud_m.shape[:2]
     left, top, right, bottom = detection.box_xyxy_px
+    more = margin * max(right - left, bottom - top)
+    left, top, right, bottom = left - more, top - more, right + more, bottom + more
     u0, u1 = int(np.clip(np.floor(left), 0, width)), int(np.clip(np.ceil(right) + 1, 0, width))
     v0, v1 = int(np.clip(np.floor(top), 0, height)), int(np.clip(np.ceil(bottom) + 1, 0, height))
     grid = np.arange(v0, v1)[:, None] * width + np.arange(u0, u1)[None, :]
