@@ -32,17 +32,24 @@ def render(
     view: Annotated[
         Literal["any", "scanner"], typer.Option(help="any: from anywhere. scanner: one rack, from above.")
     ] = "any",
+    fill: Annotated[
+        str | None, typer.Option(metavar="SHARE", help="Occupied slots: 0.3 or 0.1-0.4; default: empty to full.")
+    ] = None,
     held_out: Annotated[bool, typer.Option("--held-out", help="Grounds that no training picture has.")] = False,
     threads: Annotated[int, typer.Option(min=0, help="0: one per core. They change no picture.")] = 0,
 ) -> None:
     """Render SIMULATED pictures with exact boxes, as YOLO label files."""
     from dataclasses import replace
 
+    from tubepose.errors import ConfigError
     from tubepose.training.images import ImageSet, write_images
     from tubepose_cli.show import counted_progress, say
-    from tubepose_cli.simulate import available_cores
+    from tubepose_cli.simulate import available_cores, read_range
 
-    drawn = replace(read_labware_list(labware), variants=variants, held_out=held_out)
+    shares = read_range("--fill", fill) if fill is not None else None
+    if shares is not None and not shares[0] <= shares[1] <= 1.0:
+        raise ConfigError(f"--fill {fill}: expected shares of the slots from 0 to 1, the least first")
+    drawn = replace(read_labware_list(labware), variants=variants, held_out=held_out, fill=shares)
     with counted_progress("pictures") as show:
         source = ImageSet(drawn, seed, side, view)
         write_images(out, source, count, threads=threads or available_cores(), on_done=lambda done: show(done, count))

@@ -87,8 +87,8 @@ def _variation(
 
     base = SceneVariation() if scenes is None else load_scene_variation(scenes)
     flags: dict[str, tuple[str, Any]] = {
-        "--fill": ("fill", fill and _range("--fill", fill)),
-        "--scattering": ("scattering_per_mm", scattering and _range("--scattering", scattering)),
+        "--fill": ("fill", fill and read_range("--fill", fill)),
+        "--scattering": ("scattering_per_mm", scattering and read_range("--scattering", scattering)),
         "--liquid": ("liquid_share", liquid),
         "--labels": ("label_share", labels),
         "--perfect-parts": ("tolerances", dict.fromkeys(Tolerances.model_fields, 0.0) if perfect_parts else None),
@@ -99,7 +99,7 @@ def _variation(
     return base
 
 
-def _range(flag: str, text: str) -> tuple[float, float]:
+def read_range(flag: str, text: str) -> tuple[float, float]:
     """``0.3`` or ``0.1-0.4``."""
     from tubepose.errors import ConfigError
 

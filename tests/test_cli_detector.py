@@ -40,6 +40,14 @@ def test_a_set_of_another_recipe_is_one_line(rendered):
     assert "pictures of another recipe" in ended.errors[0]
 
 
+@pytest.mark.parametrize("fill", ["0.4-0.1", "3", "much"])
+def test_a_fill_that_is_no_share_is_one_line(tmp_path, fill):
+    ended = tubepose("detector", "render", "--out", tmp_path / "set", *SMALL, "--fill", fill)
+    assert ended.code == 1
+    assert ended.errors[0].startswith(f"error: --fill {fill}: expected")
+    assert not (tmp_path / "set").exists()
+
+
 def test_labware_is_a_list_of_names_and_files_or_the_catalogue():
     everything = read_labware_list("catalogue")
     assert len(everything.racks) + len(everything.tubes) + len(everything.caps) == len(catalogue())

@@ -157,6 +157,14 @@ def test_a_scanner_sees_all_of_one_rack_from_above():
         assert pixels.max() < 159
 
 
+def test_a_given_fill_is_kept():
+    for seed in range(4):
+        scene = random_scene(labware(variants=0.0, fill=(0.1, 0.2)), 96, np.random.default_rng(seed), "scanner")
+        tubes = [found for found in scene.objects if found.class_name != RACK_CLASS]
+        assert 1 <= len(tubes) <= 10
+    assert ImageSet(labware(fill=(0.1, 0.2))).recipe()["fill"] == [0.1, 0.2]
+
+
 def test_pictures_depend_on_recipe_and_number_alone(tmp_path):
     source = ImageSet(labware(), seed=4, long_side_px=96)
     write_images(tmp_path / "one", source, 3)

@@ -73,6 +73,7 @@ class ImageSet:
             "variants": self.labware.variants,
             "held_out_grounds": self.labware.held_out,
             "simulated": True,
+            **({"fill": list(self.labware.fill)} if self.labware.fill is not None else {}),
         }
 
 

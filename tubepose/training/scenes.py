@@ -78,6 +78,7 @@ class Labware:
         caps: Printed caps; a few tubes wear them.
         variants: Share of the racks and tubes that are random variants of the given ones.
         held_out: Put them on grounds that no picture to train on has, to judge by.
+        fill: Least and most share of a rack's slots that are tried to fill; None for anything from empty to full.
     """
 
     racks: tuple[RackModel, ...]
@@ -85,6 +86,7 @@ class Labware:
     caps: tuple[CapModel, ...] = ()
     variants: float = 0.5
     held_out: bool = False
+    fill: tuple[float, float] | None = None
 
 
 class _Builder:
@@ -126,7 +128,7 @@ class _Builder:
         shape = merge([mesh for mesh, _ in parts]).vertices_m
         self.objects[owner] = (RACK_CLASS, transform_points(T_table_rack, shape), None, 0.0)
         tubes = self._tubes_for(rack)
-        if tubes and rng.uniform() < 0.88:
+        if tubes and (self.labware.fill is not None or rng.uniform() < 0.88):
             self._fill(rack, T_table_rack, tubes)
 
     def _tubes_for(self, rack: RackModel) -> list[tuple[TubeModel, objects.TubeLook]]:
@@ -155,7 +157,10 @@ class _Builder:
     ) -> None:
         """Tubes in random slots; where caps would cut into each other a slot stays empty."""
         rng = self.rng
-        share = rng.uniform(0, 1) if rng.uniform() < 0.75 else 1.0
+        if self.labware.fill is not None:
+            share = rng.uniform(*self.labware.fill)
+        else:
+            share = rng.uniform(0, 1) if rng.uniform() < 0.75 else 1.0
         standing: list[tuple[FloatArray, float]] = []
         for k in rng.permutation(len(rack.all_slots))[: max(1, round(share * len(rack.all_slots)))]:
             tube, look = tubes[int(rng.integers(len(tubes)))]
