@@ -86,6 +86,7 @@ ALLOWED: dict[str, set[str]] = {
     "evaluation": {"labware", "pose_errors", "statistics"},
     "uncertainty": {"pose_errors", "statistics"},
     "confusion": set(),
+    "training": {"capture", "detection", "labware", "report", "simulation", "version"},
     "truth_tables": {
         "batch",
         "records",

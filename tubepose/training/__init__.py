@@ -1,0 +1,1 @@
+"""A detector that learns from labware files: labelled pictures by rendering, training, and the model's file."""
