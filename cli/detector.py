@@ -76,6 +76,10 @@ def train(
     images: Annotated[
         Path | None, typer.Option(help="Learn from this set (images/, labels/, classes.txt) and render none.")
     ] = None,
+    start: Annotated[
+        Path | None, typer.Option(help="Start from a checkpoint.pt of another training, not from photographs alone.")
+    ] = None,
+    rate: Annotated[float, typer.Option(min=1e-7, help="Largest learning rate.")] = 1e-3,
     unseen: Annotated[int, typer.Option(min=0, help="Further pictures to judge the model by; 0 for none.")] = 60,
     work: Annotated[Path | None, typer.Option(help="Folder of pictures and checkpoint; default: beside --out.")] = None,
     threads: Annotated[int, typer.Option(min=0, help="0: one per core.")] = 0,
@@ -92,13 +96,15 @@ def train(
     from tubepose_cli.show import counted_progress, say
     from tubepose_cli.simulate import available_cores
 
+    if start is not None and not start.is_file():
+        raise ConfigError(f"--start {start}: no such file; expected a checkpoint.pt of another training")
     if out.suffix != ".onnx":
         raise ConfigError(f"--out {out}: expected a name that ends in .onnx")
     require_packages()
     cores = threads or available_cores()
     folder = work if work is not None else out.with_name(f"{out.stem}-training")
     drawn = replace(read_labware_list(labware), variants=variants)
-    recipe = Recipe(steps=steps, batch=batch, side_px=sample_side, late_side_px=late_side, seed=seed)
+    recipe = Recipe(steps=steps, batch=batch, side_px=sample_side, late_side_px=late_side, rate=rate, seed=seed)
     sets = [(folder / "pictures", ImageSet(drawn, seed, side, view), pictures)] if images is None else []
     if unseen:
         judged = ImageSet(replace(drawn, held_out=True), seed + _UNSEEN_SEED, side, view)
@@ -107,7 +113,7 @@ def train(
         with counted_progress("pictures") as show:
             write_images(place, source, count, threads=cores, on_done=lambda done: show(done, count))  # noqa: B023
     files = labelled_set(images if images is not None else folder / "pictures")
-    job = TrainingJob(files, out, folder, recipe, side, cores)
+    job = TrainingJob(files, out, folder, recipe, side, cores, start)
     with counted_progress("steps") as show:
         report = train_detector(
             job, labelled_set(folder / "unseen") if unseen else None, lambda done, _loss: show(done, steps)

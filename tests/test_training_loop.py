@@ -82,6 +82,22 @@ def test_a_checkpoint_of_another_recipe_is_refused(pictures, tmp_path):
         Trainer(recipe(steps=1, rate=0.1), pictures, tmp_path, threads=1)
 
 
+def test_a_training_can_start_from_another_one(pictures, tmp_path):
+    first = Trainer(recipe(), pictures, tmp_path / "first", threads=1)
+    first.run()
+    start = tmp_path / "first" / "checkpoint.pt"
+    second = Trainer(recipe(steps=2), pictures, tmp_path / "second", threads=1, start=start)
+    assert second.step == 0
+    for one, other in zip(first.average.module.parameters(), second.network.parameters(), strict=True):
+        assert torch.equal(one, other)
+    second.run()
+    with pytest.raises(DetectorError, match="another recipe"):
+        Trainer(recipe(steps=2), pictures, tmp_path / "second", threads=1)
+    (tmp_path / "junk.pt").write_bytes(b"junk")
+    with pytest.raises(DetectorError, match=r"junk\.pt: no checkpoint to start from"):
+        Trainer(recipe(), pictures, tmp_path / "third", threads=1, start=tmp_path / "junk.pt")
+
+
 def test_the_file_gives_what_the_network_gives(pictures, tmp_path):
     torch.manual_seed(0)
     network = build_network(3, pretrained=False).eval()

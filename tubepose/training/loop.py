@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import hashlib
 import json
+import pickle
 import warnings
+import zipfile
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -68,19 +70,31 @@ class Recipe(BaseModel):
 class Trainer:
     """One run of training: a network, its average, and how far it has come."""
 
-    def __init__(self, recipe: Recipe, files: LabelledFiles, folder: Path, *, threads: int) -> None:
+    def __init__(
+        self, recipe: Recipe, files: LabelledFiles, folder: Path, *, threads: int, start: Path | None = None
+    ) -> None:
         """Start anew, or go on from the folder's checkpoint.
 
+        Args:
+            recipe: How to train.
+            files: Pictures to learn from.
+            folder: Where the checkpoint is.
+            threads: Processor threads.
+            start: Checkpoint of another training, whose averaged weights this one starts from.
+
         Raises:
-            DetectorError: A package is missing, or the checkpoint is of another recipe or other classes.
+            DetectorError: A package is missing, a checkpoint is of another recipe or other classes, or `start` is none.
         """
         import torch
 
         self.recipe, self.files, self.folder = recipe, files, folder
+        self.start_sha256 = hashlib.sha256(start.read_bytes()).hexdigest() if start is not None else ""
         torch.set_num_threads(threads)
         torch.manual_seed(recipe.seed)
         self.device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
-        network = build_network(len(files.classes), pretrained=recipe.pretrained)
+        network = build_network(len(files.classes), pretrained=recipe.pretrained and start is None)
+        if start is not None:
+            _load_average(network, start)
         self.network = network.to(self.device, memory_format=torch.channels_last)
         _freeze(self.network, recipe.frozen_blocks)
         self.optimizer = torch.optim.AdamW(_groups(self.network, recipe), lr=recipe.rate)
@@ -154,7 +168,7 @@ class Trainer:
         return [float(torch.as_tensor(found[name]).detach()) for name in _LOSSES]
 
     def _identity(self) -> str:
-        return self.recipe.sha256(*self.files.classes)
+        return self.recipe.sha256(*self.files.classes, *([self.start_sha256] if self.start_sha256 else []))
 
     def _save(self) -> None:
         import torch
@@ -183,6 +197,23 @@ class Trainer:
         self.average.load_state_dict(state["average"])
         self.optimizer.load_state_dict(state["optimizer"])
         self.step, self.losses = state["step"], state["losses"]
+
+
+def _load_average(network: torch.nn.Module, start: Path) -> None:
+    import torch
+
+    try:
+        if not zipfile.is_zipfile(start):
+            raise ValueError("no file of PyTorch")
+        state = torch.load(start, map_location="cpu", weights_only=True)["average"]
+        network.load_state_dict(
+            {name.removeprefix("module."): value for name, value in state.items() if name.startswith("module.")}
+        )
+    except (OSError, KeyError, TypeError, ValueError, RuntimeError, pickle.UnpicklingError) as problem:
+        what = " ".join(str(problem).split())[:120]
+        raise DetectorError(
+            f"{start}: no checkpoint to start from ({what}); expected {CHECKPOINT} of a training with as many classes"
+        ) from None
 
 
 def _freeze(network: torch.nn.Module, blocks: int) -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import hashlib
+import json
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -38,6 +40,7 @@ class TrainingJob:
         recipe: How to train.
         side_px: Side of the network's input, once trained.
         threads: Processor threads.
+        start: Checkpoint of another training to start from; None for the photographs' weights alone.
     """
 
     files: LabelledFiles
@@ -46,6 +49,7 @@ class TrainingJob:
     recipe: Recipe
     side_px: int
     threads: int
+    start: Path | None = None
 
 
 def train_detector(
@@ -65,16 +69,18 @@ def train_detector(
     """
     if job.side_px % 32 or job.side_px < 96:
         raise DetectorError(f"side {job.side_px}: expected a multiple of 32, 96 or more")
-    trainer = Trainer(job.recipe, job.files, job.work, threads=job.threads)
+    trainer = Trainer(job.recipe, job.files, job.work, threads=job.threads, start=job.start)
     trainer.run(on_step)
     record = {"recipe": job.recipe.model_dump(), "images": _source(job.files), "input_px": job.side_px}
+    if trainer.start_sha256:
+        record["start_sha256"] = trainer.start_sha256
     export_onnx(
         trainer.average.module,
         job.out,
         job.files.classes,
         job.side_px,
         record,
-        sha256=job.recipe.sha256(*job.files.classes, str(record["images"])),
+        sha256=hashlib.sha256(json.dumps(record, sort_keys=True).encode()).hexdigest(),
     )
     write_json(job.work / RECORD_FILE, record)
     write_bytes(job.work / LOSS_FILE, loss_curve(trainer.losses))
