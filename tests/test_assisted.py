@@ -86,12 +86,26 @@ def test_a_wrong_box_of_the_network_gets_a_second_opinion_and_the_row_says_so(fr
     scene = prepare_scene(frame, RACK, TUBES, detector, CONFIG, hint_for(T_CAMERA_RACK))
     assert scene.rack_pose.status is RackStatus.OK
     row = rack_row(scene)
+    assert [entry.stage for entry in scene.times] == ["detect", "rack", "slots"]
     assert row["box_source"] == "geometric"
     assert row["box_note"].startswith("no rack in the network's box")
     assert np.allclose(
         transform_points(scene.rack_pose.T_camera_rack, np.zeros((1, 3))), T_CAMERA_RACK[:3, 3], atol=1e-3
     )
     assert sorted(target.slot for target in scene.targets) == sorted(PLACED)
+
+
+def test_a_tube_that_the_network_did_not_see_is_added_from_the_cloud(frame):
+    whole = GeometricDetector(RACK, TUBES, CONFIG).detect(frame)
+    boxes = [Detection(CAPPED_CLASS, 0.9, tube.box_xyxy_px, "yolo") for tube in whole if not tube.is_rack]
+    assert len(boxes) == len(PLACED)
+    scene = prepare_scene(frame, RACK, TUBES, assisted(rack_box(0.9), *boxes[1:]), CONFIG, hint_for(T_CAMERA_RACK))
+    assert [detection.source for detection in scene.detections] == ["yolo"] * len(boxes) + ["geometric"]
+    assert scene.detections[-1].note == "the network saw no tube there"
+    assert sorted(target.slot for target in scene.targets) == sorted(PLACED)
+    # Nobody asks for tubes one by one: nothing is looked for.
+    alone = prepare_scene(frame, RACK, TUBES, assisted(rack_box(0.9)), CONFIG, methods=("profile",))
+    assert len(alone.detections) == 1
 
 
 def test_where_the_cloud_does_not_help_either_the_first_answer_stays(frame):

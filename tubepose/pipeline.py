@@ -137,6 +137,13 @@ class _Clock:
         yield
         self.times.append(StageTime(stage, method, instance, seed, (time.perf_counter_ns() - start) / 1e6))
 
+    def shared(self) -> tuple[StageTime, ...]:
+        """One row per stage that all methods share, in the order of their beginning: what is done twice is added up."""
+        total: dict[str, float] = {}
+        for entry in self.times:
+            total[entry.stage] = total.get(entry.stage, 0.0) + entry.duration_ms
+        return tuple(StageTime(stage, "all", "", None, duration_ms) for stage, duration_ms in total.items())
+
 
 def prepare_scene(
     frame: RgbdFrame,
@@ -177,9 +184,12 @@ def prepare_scene(
             )
     targets: tuple[TubeTarget, ...] = ()
     if rack_pose.T_camera_rack is not None and any(method in TUBE_METHODS for method in methods):
+        if isinstance(detector, AssistedDetector):
+            with clock.stage("detect"):
+                detections += detector.missed(frame, rack_pose.T_camera_rack, detections)
         with clock.stage("slots"):
             targets = _targets(frame, rack, tubes, detections, rack_pose.T_camera_rack, config)
-    return Scene(frame, rack, tuple(tubes), intrinsics, detections, rack_pose, targets, tuple(clock.times))
+    return Scene(frame, rack, tuple(tubes), intrinsics, detections, rack_pose, targets, clock.shared())
 
 
 def estimate_tubes(

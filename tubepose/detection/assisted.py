@@ -4,13 +4,18 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
+import numpy as np
+
 from tubepose.capture.frame import RgbdFrame
 from tubepose.detection.geometric import GeometricDetector
 from tubepose.detection.model import Detection
 from tubepose.detection.yolo import YoloDetector
+from tubepose.transforms import FloatArray
 
 SURE_SCORE = 0.5
 """A rack that a network gives less than this is looked for in the cloud too."""
+KNOWN_SHARE = 0.5
+"""A tube of the cloud is known to the network when one of its boxes holds this share of the tube's points."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,6 +48,28 @@ class AssistedDetector:
     def second_opinion(self, frame: RgbdFrame, reason: str) -> tuple[Detection, ...]:
         """Boxes of the cloud, for a frame in which the network's rack could not be registered."""
         return self._from_cloud(frame, f"no rack in the network's box ({reason})")
+
+    def missed(
+        self, frame: RgbdFrame, T_camera_rack: FloatArray, found: tuple[Detection, ...]
+    ) -> tuple[Detection, ...]:
+        """Tubes that stand on a registered rack and of which the network says nothing.
+
+        Args:
+            frame: The frame.
+            T_camera_rack: The rack's pose, shape (4, 4), metres.
+            found: What is known; a tube most of whose points lie in one box of a tube is.
+        """
+        boxes = np.array([other.box_xyxy_px for other in found if not other.is_rack]).reshape(-1, 4)
+        missed = []
+        for tube in self.geometric.tubes_on(frame, T_camera_rack):
+            if tube.point_rows is None or not np.isfinite(tube.box_xyxy_px).all():
+                continue
+            v, u = np.divmod(tube.point_rows, frame.cloud_m.shape[1])
+            inside = (u[:, None] >= boxes[:, 0]) & (u[:, None] <= boxes[:, 2])
+            inside &= (v[:, None] >= boxes[:, 1]) & (v[:, None] <= boxes[:, 3])
+            if inside.mean(axis=0).max(initial=0.0) < KNOWN_SHARE:
+                missed.append(replace(tube, note="the network saw no tube there"))
+        return tuple(missed)
 
     def _from_cloud(self, frame: RgbdFrame, why: str) -> tuple[Detection, ...]:
         return tuple(replace(detection, note=why) for detection in self.geometric.detect(frame))

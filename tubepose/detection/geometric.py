@@ -52,16 +52,34 @@ class GeometricDetector:
         if T_camera_top is None:
             return (self._detection(frame, RACK_CLASS, 0.0, rows, rows),)
         local = transform_points(invert_transform(T_camera_top), points)
-        near = np.all(np.abs(local[:, :2]) < self.rack.outline_m / 2 + MARGIN_M, axis=1)
-        on_rack = near & (local[:, 2] > -self.rack.height_m) & (local[:, 2] < TALLEST_TUBE_M)
+        on_rack = self._on_rack(local)
         band = on_rack & (np.abs(local[:, 2]) < self.config.rack_top.band_m)
-        found = [self._detection(frame, RACK_CLASS, 1.0, rows[on_rack], rows[band])]
-        standing = on_rack & (local[:, 2] > self.config.slots.clearance_m)
-        labels = self._part(local[standing], self.rack.slot_centers_m)
-        for label in range(labels.max(initial=-1) + 1):
-            members = rows[standing][labels == label]
-            found.append(self._detection(frame, TUBE_CLASS, 1.0, members, members))
-        return tuple(found)
+        rack = self._detection(frame, RACK_CLASS, 1.0, rows[on_rack], rows[band])
+        return (rack, *self._standing(frame, rows[on_rack], local[on_rack]))
+
+    def tubes_on(self, frame: RgbdFrame, T_camera_rack: FloatArray) -> tuple[Detection, ...]:
+        """A ``tube`` for every group of points that stands on a rack whose pose is known.
+
+        Args:
+            frame: The frame.
+            T_camera_rack: Array of shape (4, 4); maps rack points to camera points, metres.
+        """
+        rows = np.flatnonzero(frame.valid)
+        local = transform_points(invert_transform(top_frame(T_camera_rack, self.rack)), frame.points_m[rows])
+        on_rack = self._on_rack(local)
+        return self._standing(frame, rows[on_rack], local[on_rack])
+
+    def _on_rack(self, local_m: FloatArray) -> NDArray[np.bool_]:
+        """Which points (N, 3), frame of the top, are of the rack or of what stands on it."""
+        near = np.all(np.abs(local_m[:, :2]) < self.rack.outline_m / 2 + MARGIN_M, axis=1)
+        return np.asarray(near & (local_m[:, 2] > -self.rack.height_m) & (local_m[:, 2] < TALLEST_TUBE_M))
+
+    def _standing(self, frame: RgbdFrame, rows: NDArray[np.intp], local_m: FloatArray) -> tuple[Detection, ...]:
+        """Tubes among points of the rack: their rows of the frame (N,), and themselves (N, 3), frame of the top."""
+        standing = local_m[:, 2] > self.config.slots.clearance_m
+        labels = self._part(local_m[standing], self.rack.slot_centers_m)
+        groups = (rows[standing][labels == label] for label in range(labels.max(initial=-1) + 1))
+        return tuple(self._detection(frame, TUBE_CLASS, 1.0, members, members) for members in groups)
 
     def _find_top(self, points_m: FloatArray) -> FloatArray | None:
         """T_camera_top, origin at the middle of the rack's top, z up; None where no band fits the rack."""
