@@ -60,7 +60,7 @@ def bench(
     from tubepose.config import load_config
     from tubepose.errors import TubePoseError
     from tubepose.truth_tables import with_exact_rack
-    from tubepose_cli.inputs import find_sessions, make_detector, read_methods, sample_session
+    from tubepose_cli.inputs import find_sessions, make_detector, read_methods, sample_session, used_model
     from tubepose_cli.results import run_estimates
     from tubepose_cli.show import finish, say
     from tubepose_cli.truth import measure_sessions
@@ -85,7 +85,7 @@ def bench(
     tables = run_estimates(
         jobs, names, detector_for, settings, out, sys.argv, seeds=seeds, overlays=overlays, fail_fast=fail_fast,
         warm_up=True, inputs=[
-            *(path for path in (model, boxes, classes, config) if path is not None),
+            *(path for path in (used_model(detector, model), boxes, classes, config) if path is not None),
             *(session.folder for session in measured.sessions),
         ],
         problems=[*problems, *measured.problems], detector=detector, ground_truth_config=measured.config,

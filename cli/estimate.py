@@ -65,7 +65,7 @@ def estimate(
     from tubepose.capture.session import SESSION_FILE, is_session
     from tubepose.config import load_config
     from tubepose.errors import CaptureError, TubePoseError
-    from tubepose_cli.inputs import capture_jobs, make_detector, read_methods, read_tubes, refuse_twins
+    from tubepose_cli.inputs import capture_jobs, make_detector, read_methods, read_tubes, refuse_twins, used_model
     from tubepose_cli.racks import read_rack
     from tubepose_cli.results import run_estimates
     from tubepose_cli.show import describe_tubes, finish, say
@@ -95,7 +95,7 @@ def estimate(
     tables = run_estimates(
         jobs, methods, detector_for, settings, out, sys.argv, seeds=seeds, overlays=overlays, fail_fast=fail_fast,
         inputs=[
-            *(path for path in (model, boxes, classes, config) if path is not None),
+            *(path for path in (used_model(detector, model), boxes, classes, config) if path is not None),
             *(path for path in captures if path.exists() and (path.name == SESSION_FILE or is_session(path))),
         ],
         problems=problems, detector=detector,

@@ -164,6 +164,13 @@ def refuse_twins(found: Sequence[Job], others: Sequence[Job]) -> tuple[list[Job]
     return kept, problems
 
 
+def used_model(detector: str, model: Path | None) -> Path | None:
+    """The network that a run depends on: as given, or the bundled one of ``yolo``."""
+    from tubepose.detection.bundled import bundled_model
+
+    return bundled_model() if model is None and detector == "yolo" else model
+
+
 def make_detector(
     name: str, model: Path | None, boxes: Path | None, classes: Path | None, layout: str | None, config: Config
 ) -> DetectorFactory:
