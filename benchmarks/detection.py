@@ -101,8 +101,8 @@ def compared(exact: Path, other: Path) -> Iterator[str]:
     groups = [dict(iter(table[table["tube"].notna()].groupby(keys))) for table in tables]
     for key, first in groups[0].items():
         second = groups[1].get(key, first.iloc[:0])
-        kept = [int((table["status"] == "ok").sum()) for table in (first, second)]
-        means = [table.loc[table["status"] == "ok", list(columns)].abs().mean() for table in (first, second)]
+        kept = [int((table["outcome"] == "ok").sum()) for table in (first, second)]
+        means = [table.loc[table["outcome"] == "ok", list(columns)].abs().mean() for table in (first, second)]
         growth = (means[1] / means[0] - 1).dropna()
         worst = str(growth.idxmax()) if len(growth) else ""
         share = f"{growth.max() * 100:+.1f} %" if len(growth) else ""

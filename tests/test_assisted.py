@@ -103,6 +103,22 @@ def test_a_tube_that_the_network_did_not_see_is_added_from_the_cloud(frame):
     assert [detection.source for detection in scene.detections] == ["yolo"] * len(boxes) + ["geometric"]
     assert scene.detections[-1].note == "the network saw no tube there"
     assert sorted(target.slot for target in scene.targets) == sorted(PLACED)
+    # Boxes that are a little off cost no points: they are the cloud's.
+    off = [replace(box, box_xyxy_px=tuple(np.add(box.box_xyxy_px, 4.0))) for box in boxes]
+    shifted = prepare_scene(frame, RACK, TUBES, assisted(rack_box(0.9), *off), CONFIG, hint_for(T_CAMERA_RACK))
+    assert [len(target.points_m) for target in shifted.targets] == [
+        len(target.points_m)
+        for target in sorted(scene.targets, key=lambda t: [x.slot for x in shifted.targets].index(t.slot))
+    ]
+    # A doubtful box on an empty slot goes, a sure one stays.
+    place = transform_points(T_CAMERA_RACK, np.array([[*RACK.slot("B3").center_m, RACK.height_m]]))
+    u, v = scenes.CAMERA.project(place)[0]
+    for score, kept in ((0.3, 0), (0.8, 1)):
+        nothing = Detection(OPEN_CLASS, score, (u - 9, v - 9, u + 9, v + 9), "yolo")
+        told = assisted(rack_box(0.9), nothing, *boxes)
+        found = prepare_scene(frame, RACK, TUBES, told, CONFIG, hint_for(T_CAMERA_RACK)).detections
+        assert sum(detection is nothing for detection in found) == kept
+        assert len(found) == 1 + len(boxes) + kept
     # Nobody asks for tubes one by one: nothing is looked for.
     alone = prepare_scene(frame, RACK, TUBES, assisted(rack_box(0.9)), CONFIG, methods=("profile",))
     assert len(alone.detections) == 1

@@ -186,7 +186,7 @@ def prepare_scene(
     if rack_pose.T_camera_rack is not None and any(method in TUBE_METHODS for method in methods):
         if isinstance(detector, AssistedDetector):
             with clock.stage("detect"):
-                detections += detector.missed(frame, rack_pose.T_camera_rack, detections)
+                detections = detector.checked(frame, rack_pose.T_camera_rack, detections)
         with clock.stage("slots"):
             targets = _targets(frame, rack, tubes, detections, rack_pose.T_camera_rack, config)
     return Scene(frame, rack, tuple(tubes), intrinsics, detections, rack_pose, targets, clock.shared())

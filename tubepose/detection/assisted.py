@@ -5,17 +5,20 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.optimize import linear_sum_assignment
 
 from tubepose.capture.frame import RgbdFrame
+from tubepose.detection.boxes import edges_from_box
 from tubepose.detection.geometric import GeometricDetector
+from tubepose.detection.metrics import overlaps
 from tubepose.detection.model import Detection
 from tubepose.detection.yolo import YoloDetector
 from tubepose.transforms import FloatArray
 
 SURE_SCORE = 0.5
-"""A rack that a network gives less than this is looked for in the cloud too."""
-KNOWN_SHARE = 0.5
-"""A tube of the cloud is known to the network when one of its boxes holds this share of the tube's points."""
+"""A rack that a network gives less than this is looked for in the cloud too, a tube must be seen there."""
+KNOWN_SHARE = 0.2
+"""Least overlap of a network's box and of a tube of the cloud (intersection over union) that can be one."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,27 +52,40 @@ class AssistedDetector:
         """Boxes of the cloud, for a frame in which the network's rack could not be registered."""
         return self._from_cloud(frame, f"no rack in the network's box ({reason})")
 
-    def missed(
+    def checked(
         self, frame: RgbdFrame, T_camera_rack: FloatArray, found: tuple[Detection, ...]
     ) -> tuple[Detection, ...]:
-        """Tubes that stand on a registered rack and of which the network says nothing.
+        """Boxes of tubes against what stands on a registered rack: one box, one tube.
+
+        A tube that both see keeps the network's box, class and score, and gets the points of the cloud's tube: a box
+        that is a little off cuts none away. A tube of the cloud without a box of its own is added. A tube's box without
+        a tube of the cloud stays if the network is sure of it.
 
         Args:
             frame: The frame.
             T_camera_rack: The rack's pose, shape (4, 4), metres.
-            found: What is known; a tube most of whose points lie in one box of a tube is.
+            found: What is known so far; where the cloud has helped already, all of it is the cloud's.
         """
-        boxes = np.array([other.box_xyxy_px for other in found if not other.is_rack]).reshape(-1, 4)
-        missed = []
-        for tube in self.geometric.tubes_on(frame, T_camera_rack):
-            if tube.point_rows is None or not np.isfinite(tube.box_xyxy_px).all():
-                continue
-            v, u = np.divmod(tube.point_rows, frame.cloud_m.shape[1])
-            inside = (u[:, None] >= boxes[:, 0]) & (u[:, None] <= boxes[:, 2])
-            inside &= (v[:, None] >= boxes[:, 1]) & (v[:, None] <= boxes[:, 3])
-            if inside.mean(axis=0).max(initial=0.0) < KNOWN_SHARE:
-                missed.append(replace(tube, note="the network saw no tube there"))
-        return tuple(missed)
+        if any(box.source == self.geometric.name for box in found):
+            return found
+        told = [k for k, box in enumerate(found) if not box.is_rack and box.source == self.name]
+        standing = [
+            tube for tube in self.geometric.tubes_on(frame, T_camera_rack) if np.isfinite(tube.box_xyxy_px).all()
+        ]
+        edges = [
+            np.array([edges_from_box(box.box_xyxy_px) for box in boxes], float).reshape(-1, 4)
+            for boxes in (standing, [found[k] for k in told])
+        ]
+        shares = overlaps(*edges)
+        pairs = [(k, m) for k, m in zip(*linear_sum_assignment(-shares), strict=True) if shares[k, m] >= KNOWN_SHARE]
+        seen = {told[int(m)]: standing[int(k)] for k, m in pairs}
+        kept = [
+            replace(box, point_rows=seen[k].point_rows) if k in seen else box
+            for k, box in enumerate(found)
+            if k not in told or k in seen or box.score >= SURE_SCORE
+        ]
+        without = {*range(len(standing))} - {int(k) for k, _ in pairs}
+        return (*kept, *(replace(standing[k], note="the network saw no tube there") for k in sorted(without)))
 
     def _from_cloud(self, frame: RgbdFrame, why: str) -> tuple[Detection, ...]:
         return tuple(replace(detection, note=why) for detection in self.geometric.detect(frame))
