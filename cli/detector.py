@@ -89,6 +89,7 @@ def train(
 
     from tubepose.detection.labelled_images import labelled_set
     from tubepose.errors import ConfigError
+    from tubepose.labware.reading import validate
     from tubepose.training.images import ImageSet, write_images
     from tubepose.training.loop import Recipe
     from tubepose.training.network import require_packages
@@ -100,11 +101,16 @@ def train(
         raise ConfigError(f"--start {start}: no such file; expected a checkpoint.pt of another training")
     if out.suffix != ".onnx":
         raise ConfigError(f"--out {out}: expected a name that ends in .onnx")
+    given = {
+        "steps": steps, "batch": batch, "side_px": sample_side, "late_side_px": late_side, "rate": rate, "seed": seed,
+    }  # fmt: skip
+    recipe = validate(Recipe, given, "training", ConfigError)
+    if side % 32:
+        raise ConfigError(f"--side {side}: expected a multiple of 32")
     require_packages()
     cores = threads or available_cores()
     folder = work if work is not None else out.with_name(f"{out.stem}-training")
     drawn = replace(read_labware_list(labware), variants=variants)
-    recipe = Recipe(steps=steps, batch=batch, side_px=sample_side, late_side_px=late_side, rate=rate, seed=seed)
     sets = [(folder / "pictures", ImageSet(drawn, seed, side, view), pictures)] if images is None else []
     if unseen:
         judged = ImageSet(replace(drawn, held_out=True), seed + _UNSEEN_SEED, side, view)

@@ -113,6 +113,10 @@ def test_training_without_its_packages_names_the_extra(tmp_path, monkeypatch):
     ended = tubepose("detector", "train", "--out", tmp_path / "model.onnx")
     assert ended.code == 1
     assert "pip install 'tubepose[train]'" in ended.errors[0]
+    for option in ("--sample-side", "--late-side", "--side"):
+        ended = tubepose("detector", "train", "--out", tmp_path / "model.onnx", option, "100")
+        assert ended.code == 1
+        assert "multiple of 32" in ended.errors[0]
     assert "expected a name that ends in .onnx" in tubepose("detector", "train", "--out", tmp_path / "m.pt").errors[0]
     assert not list(tmp_path.iterdir())
 
