@@ -113,8 +113,8 @@ def test_exact_ends_give_exact_circles(x, y, widening, missing, start):
     seen = np.ones((1, SECTORS), bool)
     seen[0, (start + np.arange(missing)) % SECTORS] = False
     found = fit_circles(excess, seen, CONFIG, SIGMA_M, 0.0)
-    # The prior on the widening pulls by a few micrometres once not all of the circle is seen.
-    assert found.offset_m[0] == pytest.approx(offset_m, abs=6e-5)
+    # The prior on the widening pulls once not all of the circle is seen: by 0.09 mm at most with half of it.
+    assert found.offset_m[0] == pytest.approx(offset_m, abs=9e-5 if missing else 1e-6)
     assert found.sectors[0] == pytest.approx(1 - missing / SECTORS)
     assert np.all(np.linalg.eigvalsh(found.covariance_m2[0]) > 0)
 
