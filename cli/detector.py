@@ -10,6 +10,7 @@ import typer
 
 if TYPE_CHECKING:
     from tubepose.detection.evaluation import DetectionReport
+    from tubepose.training.images import ImageSet
     from tubepose.training.scenes import Labware
 
 app = typer.Typer(help="Detectors that learn from labware files alone, and how good they are.", no_args_is_help=True)
@@ -42,17 +43,15 @@ def render(
     from dataclasses import replace
 
     from tubepose.errors import ConfigError
-    from tubepose.training.images import ImageSet, write_images
-    from tubepose_cli.show import counted_progress, say
+    from tubepose.training.images import ImageSet
+    from tubepose_cli.show import say
     from tubepose_cli.simulate import available_cores, read_range
 
     shares = read_range("--fill", fill) if fill is not None else None
     if shares is not None and not shares[0] <= shares[1] <= 1.0:
         raise ConfigError(f"--fill {fill}: expected shares of the slots from 0 to 1, the least first")
     drawn = replace(read_labware_list(labware), variants=variants, held_out=held_out, fill=shares)
-    with counted_progress("pictures") as show:
-        source = ImageSet(drawn, seed, side, view)
-        write_images(out, source, count, threads=threads or available_cores(), on_done=lambda done: show(done, count))
+    _render(out, ImageSet(drawn, seed, side, view), count, threads or available_cores())
     say(f"{out}: {count} rendered pictures with labels")
 
 
@@ -90,7 +89,7 @@ def train(
     from tubepose.detection.labelled_images import labelled_set
     from tubepose.errors import ConfigError
     from tubepose.labware.reading import validate
-    from tubepose.training.images import ImageSet, write_images
+    from tubepose.training.images import ImageSet
     from tubepose.training.loop import Recipe
     from tubepose.training.network import require_packages
     from tubepose.training.train import LOSS_FILE, SAMPLES_FILE, TrainingJob, train_detector
@@ -116,8 +115,7 @@ def train(
         judged = ImageSet(replace(drawn, held_out=True), seed + _UNSEEN_SEED, side, view)
         sets.append((folder / "unseen", judged, unseen))
     for place, source, count in sets:
-        with counted_progress("pictures") as show:
-            write_images(place, source, count, threads=cores, on_done=lambda done: show(done, count))  # noqa: B023
+        _render(place, source, count, cores)
     files = labelled_set(images if images is not None else folder / "pictures")
     job = TrainingJob(files, out, folder, recipe, side, cores, start)
     with counted_progress("steps") as show:
@@ -175,6 +173,15 @@ def evaluate(
         cv2.imwrite(str(aside), worst_sheet(files, report, kinds, score))
     show_report(report, f"{len(files.images)} pictures, score {score:g} or more, overlap 0.5")
     say(f"{out}: {SUMMARY_FILE}, {SUCCESS_FILE}, {WORST_FILE}")
+
+
+def _render(out: Path, source: ImageSet, count: int, threads: int) -> None:
+    """Render what is missing of a set, with progress."""
+    from tubepose.training.images import write_images
+    from tubepose_cli.show import counted_progress
+
+    with counted_progress("pictures") as show:
+        write_images(out, source, count, threads=threads, on_done=lambda done: show(done, count))
 
 
 def show_report(report: DetectionReport, title: str) -> None:

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from tubepose.detection import Detection
 from tubepose.detection.evaluation import evaluate_detector, kinds_of
 from tubepose.detection.labelled_images import find_labelled, labelled_set
-from tubepose.detection.metrics import ImageBoxes, average_precision, match, overlaps, score
+from tubepose.detection.metrics import ComparedBoxes, average_precision, match, overlaps, score
 from tubepose.errors import DetectorError
 
 NONE = np.empty((0, 4))
@@ -18,7 +18,7 @@ def boxes(*rows):
 
 
 def image(truth, found, scores, ignored=NONE):
-    return ImageBoxes(truth, found, np.array(scores, float), ignored)
+    return ComparedBoxes(truth, found, np.array(scores, float), ignored)
 
 
 def test_overlap_of_known_boxes():

@@ -10,11 +10,12 @@ from hypothesis import strategies as st
 from tubepose.capture.frame import CameraIntrinsics
 from tubepose.detection.labelled_images import labelled_set
 from tubepose.detection.model import CAPPED_CLASS, OPEN_CLASS, RACK_CLASS, visible_class
+from tubepose.detection.yolo_input import BORDER
 from tubepose.errors import DetectorError
 from tubepose.labware import load_cap, load_rack, load_tube
 from tubepose.simulation.meshes import box, revolve
 from tubepose.training.appearance import NOTHING, Lamp, Light, Part, Surface
-from tubepose.training.augmentation import BORDER, draw_sample
+from tubepose.training.augmentation import draw_sample
 from tubepose.training.images import CLASSES, ImageSet, write_images
 from tubepose.training.labels import label_objects
 from tubepose.training.render import render

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
-from dataclasses import dataclass, field
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,6 +22,7 @@ from tubepose.profile import ProfileTube, fit_profiles
 from tubepose.rack import RackPose, RackStatus, register_rack
 from tubepose.rivals import fit_gicp, fit_kiss_matcher
 from tubepose.slots import SlotAssignment, assign_slots, crop_to_slot, identify_tube
+from tubepose.stage_times import Clock, StageTime
 from tubepose.transforms import FloatArray, invert_transform, transform_points
 from tubepose.tube import TubeMethod, TubePose, TubeStatus, fit_tube
 
@@ -41,25 +41,6 @@ METHODS = (DEFAULT_METHOD, *TUBE_METHODS)
 RACK_MARGIN = 0.05
 """A rack is looked for in a little more than its box: a box that is drawn too tight cuts its edges off."""
 STOCHASTIC = frozenset({"global-icp", "kiss-matcher"})
-
-
-@dataclass(frozen=True, slots=True)
-class StageTime:
-    """How long one instance of a stage took.
-
-    Attributes:
-        stage: ``load``, ``detect``, ``rack``, ``slots`` or ``tube``.
-        method: The tube method, or ``all`` for a stage that every method shares.
-        instance: The slot for a tube, else empty.
-        seed: Seed of a stochastic method, else None.
-        duration_ms: Wall time, milliseconds.
-    """
-
-    stage: str
-    method: str
-    instance: str
-    seed: int | None
-    duration_ms: float
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -127,24 +108,6 @@ class TubeEstimate:
     T_camera_tube: FloatArray | None
 
 
-@dataclass(slots=True)
-class _Clock:
-    times: list[StageTime] = field(default_factory=list)
-
-    @contextmanager
-    def stage(self, stage: str, method: str = "all", instance: str = "", seed: int | None = None) -> Iterator[None]:
-        start = time.perf_counter_ns()
-        yield
-        self.times.append(StageTime(stage, method, instance, seed, (time.perf_counter_ns() - start) / 1e6))
-
-    def shared(self) -> tuple[StageTime, ...]:
-        """One row per stage that all methods share, in the order of their beginning: what is done twice is added up."""
-        total: dict[str, float] = {}
-        for entry in self.times:
-            total[entry.stage] = total.get(entry.stage, 0.0) + entry.duration_ms
-        return tuple(StageTime(stage, "all", "", None, duration_ms) for stage, duration_ms in total.items())
-
-
 def prepare_scene(
     frame: RgbdFrame,
     rack: RackModel,
@@ -167,7 +130,7 @@ def prepare_scene(
         T_camera_rack: The rack's pose where it is known; its registration is then left out.
         methods: Methods that will be asked; slots of detected tubes are left out where none needs them.
     """
-    clock = _Clock()
+    clock = Clock()
     intrinsics = frame.intrinsics
     if intrinsics is None and frame.organised:
         intrinsics = estimate_intrinsics(frame.cloud_m)
@@ -201,7 +164,7 @@ def estimate_tubes(
     """
     if method == DEFAULT_METHOD:
         return _profile_estimates(scene, config)
-    clock = _Clock()
+    clock = Clock()
     estimates = []
     for target in scene.targets:
         if target.slot is None or target.tube is None:
@@ -303,7 +266,7 @@ def _second_opinion(
     config: Config,
     hint: SlotHint | None,
     intrinsics: CameraIntrinsics | None,
-    clock: _Clock,
+    clock: Clock,
 ) -> tuple[tuple[Detection, ...], RackPose]:
     """Boxes and pose by the cloud's geometry where the network's rack has none; as they were where that fails too."""
     if any(detection.is_rack and detection.source == "geometric" for detection in detections):

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from functools import partial
+from operator import eq
 
 import numpy as np
 import pandas as pd
@@ -12,7 +13,7 @@ from numpy.typing import NDArray
 
 from tubepose.detection.boxes import edges_from_box
 from tubepose.detection.labelled_images import LabelledFiles
-from tubepose.detection.metrics import OVERLAPS, ImageBoxes, Scores, match, score
+from tubepose.detection.metrics import OVERLAPS, ComparedBoxes, Scores, match, score
 from tubepose.detection.model import Detection
 from tubepose.errors import DetectorError
 from tubepose.transforms import FloatArray
@@ -38,11 +39,29 @@ class Judged:
     truth: FloatArray
     found: tuple[Detection, ...]
 
-    def edges(self, chosen: Callable[[Detection], bool]) -> tuple[FloatArray, FloatArray]:
-        """Continuous edges (D, 4) and scores (D,) of the detections that are chosen."""
+    def compared(
+        self, own: Callable[[str], bool], chosen: Callable[[Detection], bool], kinds: Mapping[str, str]
+    ) -> ComparedBoxes:
+        """True boxes of some classes and some detections, to be matched.
+
+        Args:
+            own: Whether a class of the labels is one of them.
+            chosen: Whether a detection is one of them; those keep their order.
+            kinds: As `evaluate_detector`; what is ``ignore`` counts neither as found nor as missed.
+        """
         kept = [found for found in self.found if chosen(found)]
+        truth, ignored = (
+            self.truth[np.array([test(name) for name in self.truth_names], bool)]
+            for test in (own, lambda name: kinds[name] == "ignore")
+        )
         edges = np.array([edges_from_box(found.box_xyxy_px) for found in kept], float).reshape(-1, 4)
-        return edges, np.array([found.score for found in kept], float)
+        return ComparedBoxes(truth, edges, np.array([found.score for found in kept], float), ignored)
+
+    def of_kind(self, kind: str, kinds: Mapping[str, str], least_score: float = 0.0) -> ComparedBoxes:
+        """All boxes of one kind, whatever their class, with detections of a least score."""
+        return self.compared(
+            lambda name: kinds[name] == kind, lambda found: is_kind(found, kind) and found.score >= least_score, kinds
+        )
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -117,23 +136,16 @@ def evaluate_detector(
         if kind != "ignore":
             rows.append({"class": name, **asdict(_class_scores(judged, name, kind, kinds, least_score, words))})
     for word, kind in ((ALL_TUBES, "tube"), (ALL_RACKS, "rack")):
-        rows.append({"class": word, **asdict(score([_of_kind(one, kind, kinds) for one in judged], least_score))})
+        rows.append({"class": word, **asdict(score([one.of_kind(kind, kinds) for one in judged], least_score))})
     with_tubes = [one for one in judged if any(kinds[name] == "tube" for name in one.truth_names)]
     success = sum(_all_right(one, kinds, words, least_score) for one in with_tubes)
     errors = np.array([_errors(one, kinds, least_score) for one in judged], np.intp)
     return DetectionReport(pd.DataFrame(rows), len(with_tubes), success, tuple(judged), errors)
 
 
-def _is_kind(found: Detection, kind: str) -> bool:
+def is_kind(found: Detection, kind: str) -> bool:
+    """Whether a detection is a ``rack``, or a ``tube`` of any class."""
     return found.is_rack == (kind == "rack")
-
-
-def _of_kind(one: Judged, kind: str, kinds: Mapping[str, str]) -> ImageBoxes:
-    """All boxes of one kind, whatever their class."""
-    found, scores = one.edges(lambda detection: _is_kind(detection, kind))
-    is_kind = np.array([kinds[name] == kind for name in one.truth_names], bool)
-    ignored = np.array([kinds[name] == "ignore" for name in one.truth_names], bool)
-    return ImageBoxes(one.truth[is_kind], found, scores, one.truth[ignored])
 
 
 def _class_scores(
@@ -141,16 +153,13 @@ def _class_scores(
 ) -> Scores:
     """Figures of one class of the labels; where the detector has no such class, only what it finds of it."""
     if name in words:
-        pictures = []
-        for one in judged:
-            found, scores = one.edges(lambda detection: detection.class_name == name)
-            own = np.array([known == name for known in one.truth_names], bool)
-            ignored = np.array([kinds[known] == "ignore" for known in one.truth_names], bool)
-            pictures.append(ImageBoxes(one.truth[own], found, scores, one.truth[ignored]))
+        pictures = [
+            one.compared(lambda known: known == name, lambda found: found.class_name == name, kinds) for one in judged
+        ]
         return score(pictures, least_score)
     n_truth = n_found = 0
     for one in judged:
-        boxes = _answers(_of_kind(one, kind, kinds), least_score)
+        boxes = one.of_kind(kind, kinds, least_score)
         own = np.array([known == name for known in one.truth_names if kinds[known] == kind], bool)
         rows, _ = match(boxes, float(OVERLAPS[0]))
         n_truth += int(own.sum())
@@ -159,31 +168,25 @@ def _class_scores(
     return Scores(n_truth, 0, nan, n_found / n_truth if n_truth else nan, nan, nan)
 
 
-def _answers(boxes: ImageBoxes, least_score: float) -> ImageBoxes:
-    kept = boxes.scores >= least_score
-    return ImageBoxes(boxes.truth, boxes.found[kept], boxes.scores[kept], boxes.ignored)
-
-
 def _all_right(one: Judged, kinds: Mapping[str, str], words: Collection[str], least_score: float) -> bool:
     """Whether every labelled tube and rack of a picture is found, with the right class where the detector has it."""
     for name in {known for known in one.truth_names if kinds[known] != "ignore"}:
-        own = np.array([known == name for known in one.truth_names], bool)
-        found, scores = one.edges(partial(_answers_for, name if name in words else None, kinds[name]))
-        boxes = _answers(ImageBoxes(one.truth[own], found, scores, np.empty((0, 4))), least_score)
+        boxes = one.compared(partial(eq, name), partial(_answers_for, name, kinds[name], words, least_score), kinds)
         rows, _ = match(boxes, float(OVERLAPS[0]))
-        if (rows >= 0).sum() < own.sum():
+        if (rows >= 0).sum() < len(boxes.truth):
             return False
     return True
 
 
-def _answers_for(name: str | None, kind: str, found: Detection) -> bool:
-    return _is_kind(found, kind) if name is None else found.class_name == name
+def _answers_for(name: str, kind: str, words: Collection[str], least_score: float, found: Detection) -> bool:
+    """Whether a detection is an answer for a class of the labels: of that class, or of its kind where there is none."""
+    return found.score >= least_score and (found.class_name == name if name in words else is_kind(found, kind))
 
 
 def _errors(one: Judged, kinds: Mapping[str, str], least_score: float) -> int:
     count = 0
     for kind in ("tube", "rack"):
-        boxes = _answers(_of_kind(one, kind, kinds), least_score)
+        boxes = one.of_kind(kind, kinds, least_score)
         rows, ignored = match(boxes, float(OVERLAPS[0]))
         hits = int((rows >= 0).sum())
         count += len(boxes.truth) - hits + int((~ignored).sum()) - hits

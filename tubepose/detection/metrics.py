@@ -21,7 +21,7 @@ _RECALLS = np.linspace(0.0, 1.0, 101)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class ImageBoxes:
+class ComparedBoxes:
     """Truth and detections of one kind in one picture.
 
     Attributes:
@@ -60,15 +60,23 @@ class Scores:
 
 def overlaps(a: FloatArray, b: FloatArray) -> FloatArray:
     """Intersection over union of all pairs of boxes (A, 4) and (B, 4); shape (A, B)."""
-    low = np.maximum(a[:, None, :2], b[None, :, :2])
-    high = np.minimum(a[:, None, 2:], b[None, :, 2:])
-    shared = np.prod(np.clip(high - low, 0, None), axis=2)
-    areas = [np.prod(boxes[:, 2:] - boxes[:, :2], axis=1) for boxes in (a, b)]
-    union = areas[0][:, None] + areas[1][None] - shared
+    shared = _shared_area(a, b)
+    union = _area(a)[:, None] + _area(b)[None] - shared
     return np.asarray(np.divide(shared, union, out=np.zeros_like(shared), where=union > 0))
 
 
-def match(boxes: ImageBoxes, least_overlap: float) -> tuple[NDArray[np.intp], NDArray[np.bool_]]:
+def _area(boxes: FloatArray) -> FloatArray:
+    return np.asarray(np.prod(boxes[:, 2:] - boxes[:, :2], axis=1))
+
+
+def _shared_area(a: FloatArray, b: FloatArray) -> FloatArray:
+    """Area of the intersection of all pairs of boxes (A, 4) and (B, 4); shape (A, B)."""
+    low = np.maximum(a[:, None, :2], b[None, :, :2])
+    high = np.minimum(a[:, None, 2:], b[None, :, 2:])
+    return np.asarray(np.prod(np.clip(high - low, 0, None), axis=2))
+
+
+def match(boxes: ComparedBoxes, least_overlap: float) -> tuple[NDArray[np.intp], NDArray[np.bool_]]:
     """Match detections to true boxes, best score first.
 
     A detection without a match that overlaps an ignored box, or lies in one by more than half, is ignored too.
@@ -92,17 +100,14 @@ def match(boxes: ImageBoxes, least_overlap: float) -> tuple[NDArray[np.intp], ND
     return rows, ignored
 
 
-def _in_ignored(boxes: ImageBoxes) -> NDArray[np.bool_]:
+def _in_ignored(boxes: ComparedBoxes) -> NDArray[np.bool_]:
     if not len(boxes.ignored):
         return np.zeros(len(boxes.found), bool)
-    low = np.maximum(boxes.found[:, None, :2], boxes.ignored[None, :, :2])
-    high = np.minimum(boxes.found[:, None, 2:], boxes.ignored[None, :, 2:])
-    shared = np.prod(np.clip(high - low, 0, None), axis=2).max(axis=1)
-    area = np.prod(boxes.found[:, 2:] - boxes.found[:, :2], axis=1)
-    return np.asarray(shared > 0.5 * area)
+    shared = _shared_area(boxes.found, boxes.ignored).max(axis=1)
+    return np.asarray(shared > 0.5 * _area(boxes.found))
 
 
-def score(images: Sequence[ImageBoxes], least_score: float) -> Scores:
+def score(images: Sequence[ComparedBoxes], least_score: float) -> Scores:
     """Figures of one kind of box over pictures.
 
     Args:

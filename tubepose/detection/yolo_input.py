@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from tubepose.errors import DetectorError
 from tubepose.transforms import FloatArray
 
-# Gray of the border in the training of all YOLO families.
-_BORDER = 114
+BORDER = 114
+"""Gray of the border in the training of all YOLO families."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,7 +33,7 @@ class Letterbox:
 
     def apply(self, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
         """Resize an image (H, W, 3) and put the border around it; shape (net height, net width, 3)."""
-        canvas = np.full((self.net_size[1], self.net_size[0], 3), _BORDER, dtype=np.uint8)
+        canvas = np.full((self.net_size[1], self.net_size[0], 3), BORDER, dtype=np.uint8)
         (left, top), (width, height) = self.pad, self.resized
         canvas[top : top + height, left : left + width] = cv2.resize(
             image, (width, height), interpolation=cv2.INTER_LINEAR

@@ -69,7 +69,7 @@ class Surfaces:
         if self.empty or n == 0:
             nothing = np.zeros((n, 3))
             return Hits(np.full(n, np.inf), nothing, nothing, np.zeros(n, dtype=np.intp))
-        answer = self.scene.cast_rays(_rays(origins_m, directions), nthreads=self.threads)
+        answer = self.scene.cast_rays(ray_tensor(origins_m, directions), nthreads=self.threads)
         distance = answer["t_hit"].numpy().astype(float)
         hit = np.isfinite(distance)
         triangle = np.where(hit, answer["primitive_ids"].numpy(), 0).astype(np.intp)
@@ -85,7 +85,7 @@ class Surfaces:
         """Whether anything lies between points (N, 3) and one end point."""
         if self.empty or len(starts_m) == 0:
             return np.zeros(len(starts_m), dtype=bool)
-        rays = _rays(starts_m, end_m - starts_m)
+        rays = ray_tensor(starts_m, end_m - starts_m)
         return np.asarray(self.scene.test_occlusions(rays, tnear=0.0, tfar=1.0, nthreads=self.threads).numpy())
 
     def transmission(self, starts_m: FloatArray, end_m: FloatArray) -> FloatArray:
@@ -94,7 +94,7 @@ class Surfaces:
         rows = np.flatnonzero(self.blocked(starts_m, end_m))
         if len(rows) == 0:
             return share
-        found = self.scene.list_intersections(_rays(starts_m[rows], end_m - starts_m[rows]), nthreads=self.threads)
+        found = self.scene.list_intersections(ray_tensor(starts_m[rows], end_m - starts_m[rows]), nthreads=self.threads)
         between = found["t_hit"].numpy() < 1.0
         triangle = found["primitive_ids"].numpy()[between].astype(np.intp)
         index = self.index[triangle]
@@ -104,7 +104,8 @@ class Surfaces:
         return share
 
 
-def _rays(origins_m: FloatArray, directions: FloatArray) -> o3d.core.Tensor:
+def ray_tensor(origins_m: FloatArray | Float32Array, directions: FloatArray | Float32Array) -> o3d.core.Tensor:
+    """Rays as Open3D casts them: origins and directions (N, 3) side by side, shape (N, 6), float32."""
     rays = np.empty((len(directions), 6), dtype=np.float32)
     rays[:, :3], rays[:, 3:] = origins_m, directions
     return o3d.core.Tensor.from_numpy(rays)

@@ -9,11 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tubepose.detection.labelled_images import LabelledFiles
+from tubepose.detection.yolo_input import BORDER
 from tubepose.transforms import FloatArray
 
 Image = NDArray[np.uint8]
-BORDER = 114
-"""Gray of what lies beyond a picture, as all YOLO families have it."""
 _KEPT_SHARE = 0.25
 """A box of which a crop leaves less than this is dropped."""
 _MIN_SIDE_PX = 4.0

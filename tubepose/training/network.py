@@ -55,14 +55,16 @@ def build_network(class_count: int, *, pretrained: bool = True) -> torch.nn.Modu
         pretrained: Start from the backbone's ImageNet weights; otherwise from random ones.
     """
     require_packages()
+    import torch
     from yolox.models import YoloxHead, YoloxModule
 
     head = YoloxHead(class_count, _HEAD_WIDTH, list(STRIDES), [channels * 4 for channels in _NECK_CHANNELS])
     head.initialize_biases(_PRIOR)
     network = YoloxModule(_neck(_backbone(pretrained)), head)
-    for module in network.modules():
+    own = {*network.modules()} - {*network.backbone.backbone.modules()}
+    for module in own:
         # YOLOX's own settings for its normalisation layers.
-        if type(module).__name__ == "BatchNorm2d" and module not in set(network.backbone.backbone.modules()):
+        if isinstance(module, torch.nn.BatchNorm2d):
             module.eps, module.momentum = 1e-3, 0.03
     return network
 

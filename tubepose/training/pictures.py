@@ -9,10 +9,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from tubepose.detection.boxes import edges_from_box
-from tubepose.detection.evaluation import DetectionReport, Judged
+from tubepose.detection.evaluation import DetectionReport, Judged, is_kind
 from tubepose.detection.labelled_images import LabelledFiles
-from tubepose.detection.metrics import ImageBoxes, match
+from tubepose.detection.metrics import match
 
 Picture = NDArray[np.uint8]
 _TILE_PX = 480
@@ -53,18 +52,15 @@ def judged_picture(files: LabelledFiles, one: Judged, kinds: dict[str, str], lea
     picture = np.ascontiguousarray(files.read_image(one.number)[:, :, ::-1])
     thick = max(1, round(max(picture.shape[:2]) / 640))
     for kind in ("rack", "tube"):
-        own = np.array([kinds[name] == kind for name in one.truth_names], bool)
-        ignored = np.array([kinds[name] == "ignore" for name in one.truth_names], bool)
-        kept = [d for d in one.found if d.score >= least_score and d.is_rack == (kind == "rack")]
-        edges = np.array([edges_from_box(d.box_xyxy_px) for d in kept], float).reshape(-1, 4)
-        boxes = ImageBoxes(one.truth[own], edges, np.array([d.score for d in kept], float), one.truth[ignored])
+        kept = [found for found in one.found if found.score >= least_score and is_kind(found, kind)]
+        boxes = one.of_kind(kind, kinds, least_score)
         rows, passed = match(boxes, 0.5)
         for box in boxes.ignored:
             _draw(picture, box, _IGNORED, thick, "")
         for row, box in enumerate(boxes.truth):
             if row not in rows:
                 _draw(picture, box, _MISSED, thick, "")
-        for detection, box, row, skip in zip(kept, edges, rows, passed, strict=True):
+        for detection, box, row, skip in zip(kept, boxes.found, rows, passed, strict=True):
             color = _RIGHT if row >= 0 else _IGNORED if skip else _WRONG
             name = detection.class_name.removeprefix("tube-")[0]
             _draw(picture, box, color, thick, f"{name}{detection.score * 100:.0f}")

@@ -16,6 +16,7 @@ import open3d as o3d
 from numpy.typing import NDArray
 
 from tubepose.capture.frame import CameraIntrinsics
+from tubepose.simulation.raycast import ray_tensor
 from tubepose.training.appearance import NOTHING, Float32Array, Light, Part
 
 _LAYERS = 6
@@ -64,7 +65,7 @@ class _Solids:
         if not self.parts or not len(rays):
             n = len(rays)
             return np.full(n, np.inf, np.float32), np.zeros(n, np.intp), np.zeros((n, 3), np.float32)
-        found = self.scene.cast_rays(_six(origins, rays), nthreads=1)
+        found = self.scene.cast_rays(ray_tensor(origins, rays), nthreads=1)
         distance = found["t_hit"].numpy()
         part = np.where(np.isfinite(distance), found["geometry_ids"].numpy(), 0).astype(np.intp)
         return distance, part, found["primitive_normals"].numpy()
@@ -73,14 +74,8 @@ class _Solids:
         """1 where nothing opaque lies between origins and origins + far * towards, else 0."""
         if not self.parts or not len(origins):
             return np.ones(len(origins), np.float32)
-        hit = self.scene.test_occlusions(_six(origins, towards), tnear=0.0, tfar=far, nthreads=1).numpy()
+        hit = self.scene.test_occlusions(ray_tensor(origins, towards), tnear=0.0, tfar=far, nthreads=1).numpy()
         return np.asarray(~hit, np.float32)
-
-
-def _six(origins: Float32Array, rays: Float32Array) -> o3d.core.Tensor:
-    both = np.empty((len(rays), 6), np.float32)
-    both[:, :3], both[:, 3:] = origins, rays
-    return o3d.core.Tensor.from_numpy(both)
 
 
 def render(parts: Sequence[Part], light: Light, intrinsics: CameraIntrinsics, rng: np.random.Generator) -> Rendered:
