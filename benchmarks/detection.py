@@ -121,7 +121,11 @@ def timed(images: Path, model: Path, threads: int) -> Iterator[str]:
         whole.append((time.perf_counter() - start) * 1e3)
     low, middle, high = np.percentile(whole[len(pictures) :], [5, 50, 95])
     shape = " x ".join(str(side) for side in pictures[0].shape[::-1])
-    yield f"{len(pictures)} pictures of {shape}, input of {detector.net_size[0]}, {threads} threads:"
+    looks = detector.looks
+    size = (
+        f"{detector.net_size[0]}" if looks is None else f"{looks.whole_px} for the whole, {looks.rack_px} for each rack"
+    )
+    yield f"{len(pictures)} pictures of {shape}, input of {size}, {threads} threads:"
     yield f"median {middle:.0f} ms"
     yield f"(5 to 95 %: {low:.0f} to {high:.0f} ms); the paper's network took 96 ms on an RTX 4090"
 

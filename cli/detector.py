@@ -66,14 +66,19 @@ def train(
     batch: Annotated[int, typer.Option(min=1, help="Samples a batch.")] = 8,
     sample_side: Annotated[int, typer.Option(min=96, help="Side of a training sample, pixels.")] = 384,
     late_side: Annotated[int, typer.Option(min=96, help="Its side in the last fifth of the training.")] = 544,
-    side: Annotated[int, typer.Option(min=96, help="Side of the model's input, and of the pictures.")] = 640,
+    side: Annotated[int, typer.Option(min=96, help="Longer side of the model's input for one rack.")] = 640,
+    whole_side: Annotated[int, typer.Option(min=96, help="The same for a whole picture, where it finds racks.")] = 416,
+    picture_side: Annotated[int, typer.Option(min=96, max=2064, help="Longer side of rendered pictures.")] = 1024,
     variants: Annotated[float, typer.Option(min=0, max=1, help="Share of random variants of the labware.")] = 0.5,
     view: Annotated[
         Literal["any", "scanner"], typer.Option(help="any: from anywhere. scanner: one rack, from above.")
     ] = "any",
     seed: Annotated[int, typer.Option(min=0, help="Of the pictures and of the training.")] = 0,
     images: Annotated[
-        Path | None, typer.Option(help="Learn from this set (images/, labels/, classes.txt) and render none.")
+        list[Path] | None,
+        typer.Option(
+            help="Learn from this set (images/, labels/, classes.txt) and render none; several: give it again."
+        ),
     ] = None,
     start: Annotated[
         Path | None, typer.Option(help="Start from a checkpoint.pt of another training, not from photographs alone.")
@@ -86,7 +91,9 @@ def train(
     """Train a detector from labware files alone, on rendered pictures. A training that was cut off goes on."""
     from dataclasses import replace
 
-    from tubepose.detection.labelled_images import labelled_set
+    from tubepose.detection.closer_look import MARGIN, Looks
+    from tubepose.detection.labelled_images import labelled_set, labelled_sets
+    from tubepose.detection.yolo_session import SIZE_STEP
     from tubepose.errors import ConfigError
     from tubepose.labware.reading import validate
     from tubepose.training.images import ImageSet
@@ -100,24 +107,26 @@ def train(
         raise ConfigError(f"--start {start}: no such file; expected a checkpoint.pt of another training")
     if out.suffix != ".onnx":
         raise ConfigError(f"--out {out}: expected a name that ends in .onnx")
+    for name, value in (("--side", side), ("--whole-side", whole_side)):
+        if value % SIZE_STEP:
+            raise ConfigError(f"{name} {value}: expected a multiple of {SIZE_STEP}")
     given = {
         "steps": steps, "batch": batch, "side_px": sample_side, "late_side_px": late_side, "rate": rate, "seed": seed,
+        "rack_px": round(side / (1 + 2 * MARGIN)),
     }  # fmt: skip
     recipe = validate(Recipe, given, "training", ConfigError)
-    if side % 32:
-        raise ConfigError(f"--side {side}: expected a multiple of 32")
     require_packages()
     cores = threads or available_cores()
     folder = work if work is not None else out.with_name(f"{out.stem}-training")
     drawn = replace(read_labware_list(labware), variants=variants)
-    sets = [(folder / "pictures", ImageSet(drawn, seed, side, view), pictures)] if images is None else []
+    sets = [(folder / "pictures", ImageSet(drawn, seed, picture_side, view), pictures)] if not images else []
     if unseen:
-        judged = ImageSet(replace(drawn, held_out=True), seed + _UNSEEN_SEED, side, view)
+        judged = ImageSet(replace(drawn, held_out=True), seed + _UNSEEN_SEED, picture_side, view)
         sets.append((folder / "unseen", judged, unseen))
     for place, source, count in sets:
         _render(place, source, count, cores)
-    files = labelled_set(images if images is not None else folder / "pictures")
-    job = TrainingJob(files, out, folder, recipe, side, cores, start)
+    files = labelled_sets(images or [folder / "pictures"])
+    job = TrainingJob(files, out, folder, recipe, Looks(whole_side, side), cores, start)
     with counted_progress("steps") as show:
         report = train_detector(
             job, labelled_set(folder / "unseen") if unseen else None, lambda done, _loss: show(done, steps)

@@ -103,13 +103,14 @@ def test_a_tube_that_the_network_did_not_see_is_added_from_the_cloud(frame):
     assert [detection.source for detection in scene.detections] == ["yolo"] * len(boxes) + ["geometric"]
     assert scene.detections[-1].note == "the network saw no tube there"
     assert sorted(target.slot for target in scene.targets) == sorted(PLACED)
-    # Boxes that are a little off cost no points: they are the cloud's.
-    off = [replace(box, box_xyxy_px=tuple(np.add(box.box_xyxy_px, 4.0))) for box in boxes]
-    shifted = prepare_scene(frame, RACK, TUBES, assisted(rack_box(0.9), *off), CONFIG, hint_for(T_CAMERA_RACK))
-    assert [len(target.points_m) for target in shifted.targets] == [
-        len(target.points_m)
-        for target in sorted(scene.targets, key=lambda t: [x.slot for x in shifted.targets].index(t.slot))
-    ]
+    # Doubtful boxes that are a little off cost no points: they are the cloud's. Sure ones keep their own.
+    counts = {}
+    for score, shift in ((0.4, 0.0), (0.4, 4.0), (0.9, 4.0)):
+        off = [replace(box, score=score, box_xyxy_px=tuple(np.add(box.box_xyxy_px, shift))) for box in boxes]
+        shifted = prepare_scene(frame, RACK, TUBES, assisted(rack_box(0.9), *off), CONFIG, hint_for(T_CAMERA_RACK))
+        counts[score, shift] = {target.slot: len(target.points_m) for target in shifted.targets}
+    assert counts[0.4, 0.0] == counts[0.4, 4.0]
+    assert all(counts[0.9, 4.0][slot] < counts[0.4, 4.0][slot] for slot in counts[0.9, 4.0])
     # A doubtful box on an empty slot goes, a sure one stays.
     place = transform_points(T_CAMERA_RACK, np.array([[*RACK.slot("B3").center_m, RACK.height_m]]))
     u, v = scenes.CAMERA.project(place)[0]

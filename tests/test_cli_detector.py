@@ -137,9 +137,11 @@ def test_the_bundled_model_is_small_and_says_what_it_is():
 
 def test_the_bundled_model_loads_by_its_own_word():
     detector = YoloDetector(bundled_model())
-    assert detector.layout == "yolox-decoded"
+    assert detector.layout == "yolox"
     assert detector.words == (RACK_CLASS, CAPPED_CLASS, OPEN_CLASS)
     assert detector.net_size == (640, 640)
+    assert detector.looks is not None
+    assert detector.looks.rack_px == 640
 
 
 def test_the_bundled_model_finds_the_rack_and_tubes_of_the_sample():
@@ -160,5 +162,5 @@ def test_the_bundled_model_finds_the_rack_and_tubes_of_the_sample():
 
 def test_the_runtime_needs_nothing_but_the_file():
     session = onnxruntime.InferenceSession(str(bundled_model()), providers=["CPUExecutionProvider"])
-    assert [entry.shape for entry in session.get_inputs()] == [[1, 3, 640, 640]]
+    assert [entry.shape for entry in session.get_inputs()] == [[1, 3, "height", "width"]]
     assert [entry.type for entry in session.get_inputs()] == ["tensor(float)"]

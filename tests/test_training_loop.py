@@ -8,8 +8,10 @@ import pandas as pd
 import pytest
 from commands import tubepose
 
+from tubepose.detection.closer_look import Looks
 from tubepose.detection.labelled_images import labelled_set
 from tubepose.detection.yolo import YoloDetector
+from tubepose.detection.yolo_decoding import yolox_grid
 from tubepose.errors import DetectorError
 from tubepose.training.export import export_onnx
 from tubepose.training.images import CLASSES, ImageSet, write_images
@@ -101,13 +103,17 @@ def test_a_training_can_start_from_another_one(pictures, tmp_path):
 def test_the_file_gives_what_the_network_gives(pictures, tmp_path):
     torch.manual_seed(0)
     network = build_network(3, pretrained=False).eval()
-    export_onnx(network, tmp_path / "model.onnx", CLASSES, 96, {"seed": 0}, sha256="0" * 64)
+    export_onnx(network, tmp_path / "model.onnx", CLASSES, Looks(96, 128), {"seed": 0}, sha256="0" * 64)
     detector = YoloDetector(tmp_path / "model.onnx")
     rgb = np.random.default_rng(0).integers(0, 256, (1, 3, 96, 96)).astype(np.float32)
     with torch.no_grad():
         expected = network(torch.from_numpy(rgb))[0].numpy()
     found = detector._session.run(np.ascontiguousarray(rgb[:, ::-1]))[0][0]  # the file takes BGR
+    cells, strides = yolox_grid((96, 96), len(found))
+    found = np.column_stack([(found[:, :2] + cells) * strides, np.exp(found[:, 2:4]) * strides, found[:, 4:]])
     assert np.allclose(found, expected, rtol=2e-2, atol=2e-2)
+    assert detector.looks == Looks(96, 128)
+    assert detector.detect_image(np.zeros((70, 150, 3), np.uint8)) is not None  # of any shape
 
 
 def test_the_curve_of_a_loss_is_a_picture():
@@ -122,7 +128,8 @@ def test_a_rack_and_a_tube_of_ones_own_are_found_after_a_minute_or_two(tmp_path)
     out = tmp_path / "mine.onnx"
     ended = tubepose(
         "detector", "train", "--labware", mine, "--out", out, "--pictures", "32", "--steps", "200", "--batch", "4",
-        "--sample-side", "256", "--late-side", "256", "--side", "512", "--view", "scanner", "--variants", "0",
+        "--sample-side", "256", "--late-side", "256", "--side", "320", "--whole-side", "256",
+        "--picture-side", "512", "--view", "scanner", "--variants", "0",
         "--unseen", "8", "--rate", "3e-3",
     )  # fmt: skip
     assert ended.code == 0, ended.err

@@ -15,7 +15,7 @@ from tubepose.errors import DetectorError
 from tubepose.labware import load_cap, load_rack, load_tube
 from tubepose.simulation.meshes import box, revolve
 from tubepose.training.appearance import NOTHING, Lamp, Light, Part, Surface
-from tubepose.training.augmentation import draw_sample
+from tubepose.training.augmentation import Views, draw_sample
 from tubepose.training.images import CLASSES, ImageSet, write_images
 from tubepose.training.labels import label_objects
 from tubepose.training.render import render
@@ -211,7 +211,7 @@ def red_square(tmp_path_factory):
     folder = tmp_path_factory.mktemp("set")
     for name in ("images", "labels"):
         (folder / name).mkdir()
-    (folder / "classes.txt").write_text("square\n")
+    (folder / "classes.txt").write_text("rack\n")
     for k, (x, y, w, h) in enumerate([(60, 40, 50, 30), (120, 90, 25, 45)]):
         picture = np.full((160, 220, 3), 40, np.uint8)
         picture[y : y + h, x : x + w] = (0, 0, 255)
@@ -222,9 +222,10 @@ def red_square(tmp_path_factory):
 
 
 @settings(max_examples=60, deadline=None)
-@given(seed=st.integers(0, 2**32 - 1), mosaic=st.sampled_from([0.0, 1.0]))
-def test_boxes_stay_on_their_objects_in_samples(red_square, monkeypatch_module, seed, mosaic):
-    sample = draw_sample(red_square, 128, mosaic, np.random.default_rng(seed))
+@given(seed=st.integers(0, 2**32 - 1), mosaic=st.sampled_from([0.0, 1.0]), rack_share=st.sampled_from([0.0, 1.0]))
+def test_boxes_stay_on_their_objects_in_samples(red_square, monkeypatch_module, seed, mosaic, rack_share):
+    views = Views(whole_px=220, rack_px=60, rack_share=rack_share)
+    sample = draw_sample(red_square, 128, mosaic, views, np.random.default_rng(seed))
     assert sample.image.shape == (128, 128, 3)
     red = sample.image[..., 0].astype(int) - sample.image[..., 1] > 90
     for left, top, right, bottom in sample.edges_xyxy:
@@ -250,5 +251,16 @@ def monkeypatch_module():
 
 
 def test_beyond_a_picture_is_the_gray_of_the_letterbox(red_square, monkeypatch_module):
-    images = [draw_sample(red_square, 320, 0.0, np.random.default_rng(k)).image for k in range(5)]
+    views = Views(whole_px=220, rack_px=60, rack_share=0.0)
+    images = [draw_sample(red_square, 320, 0.0, views, np.random.default_rng(k)).image for k in range(5)]
     assert all((image == BORDER).all(axis=2).any() for image in images)
+
+
+def test_racks_are_shown_about_as_large_as_they_will_be_looked_at(red_square, monkeypatch_module):
+    views = Views(whole_px=220, rack_px=60, rack_share=1.0)
+    samples = [draw_sample(red_square, 320, 0.0, views, np.random.default_rng(k)) for k in range(40)]
+    sides = [np.ptp(sample.edges_xyxy.reshape(-1, 2, 2), axis=1).max() for sample in samples if len(sample.edges_xyxy)]
+    assert len(sides) > 30
+    # 0.6 to 1.2 times that, and squeezed by a few percent.
+    assert 60 * 0.6 * 0.8 < min(sides) < 60 * 0.8
+    assert 60 * 1.0 < max(sides) < 60 * 1.2 * 1.25

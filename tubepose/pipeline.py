@@ -38,7 +38,7 @@ TUBE_METHODS: Mapping[str, TubeMethod] = {
 DEFAULT_METHOD = "profile"
 METHODS = (DEFAULT_METHOD, *TUBE_METHODS)
 """All methods; `profile` looks at the whole frame, and finds its tubes and their slots itself."""
-RACK_MARGIN = 0.05
+RACK_MARGIN = 0.10
 """A rack is looked for in a little more than its box: a box that is drawn too tight cuts its edges off."""
 STOCHASTIC = frozenset({"global-icp", "kiss-matcher"})
 

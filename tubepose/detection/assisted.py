@@ -57,8 +57,8 @@ class AssistedDetector:
     ) -> tuple[Detection, ...]:
         """Boxes of tubes against what stands on a registered rack: one box, one tube.
 
-        A tube that both see keeps the network's box, class and score, and gets the points of the cloud's tube: a box
-        that is a little off cuts none away. A tube of the cloud without a box of its own is added. A tube's box without
+        A tube that both see keeps the network's box, class and score; if the network is unsure of it, it gets the points
+        of the cloud's tube: a box that is off would cut some away. A tube of the cloud without a box of its own is added. A tube's box without
         a tube of the cloud stays if the network is sure of it.
 
         Args:
@@ -80,7 +80,7 @@ class AssistedDetector:
         pairs = [(k, m) for k, m in zip(*linear_sum_assignment(-shares), strict=True) if shares[k, m] >= KNOWN_SHARE]
         seen = {told[int(m)]: standing[int(k)] for k, m in pairs}
         kept = [
-            replace(box, point_rows=seen[k].point_rows) if k in seen else box
+            replace(box, point_rows=seen[k].point_rows) if k in seen and box.score < SURE_SCORE else box
             for k, box in enumerate(found)
             if k not in told or k in seen or box.score >= SURE_SCORE
         ]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -85,3 +86,20 @@ def labelled_set(folder: Path) -> LabelledFiles:
         DetectorError: One of them is missing, or no picture has labels.
     """
     return find_labelled(folder / "images", folder / "labels", folder / "classes.txt")
+
+
+def labelled_sets(folders: Sequence[Path]) -> LabelledFiles:
+    """Several folders as one set; a folder that is given twice counts twice.
+
+    Raises:
+        DetectorError: As `labelled_set`, or the folders have different classes.
+    """
+    sets = [labelled_set(folder) for folder in folders]
+    for folder, found in zip(folders, sets, strict=True):
+        if found.classes != sets[0].classes:
+            raise DetectorError(
+                f"{folder}: classes {', '.join(found.classes)}, but {folders[0]} has {', '.join(sets[0].classes)}; "
+                "expected the same names in the same order"
+            )
+    images, labels = (tuple(path for found in sets for path in getattr(found, name)) for name in ("images", "labels"))
+    return LabelledFiles(sets[0].classes, images, labels)

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from tubepose.capture.frame import RgbdFrame
 from tubepose.detection.boxes import box_from_edges, class_words
+from tubepose.detection.closer_look import look_twice
 from tubepose.detection.model import RACK_CLASS, Detection
 from tubepose.detection.yolo_decoding import (
     LAYOUT_SHAPES,
@@ -23,7 +24,7 @@ from tubepose.detection.yolo_decoding import (
     suppress,
 )
 from tubepose.detection.yolo_input import fit_letterbox, to_8bit_rgb, to_tensor
-from tubepose.detection.yolo_session import YoloSession, open_session
+from tubepose.detection.yolo_session import SIZE_STEP, YoloSession, open_session
 from tubepose.errors import DetectorError
 
 
@@ -39,6 +40,7 @@ class YoloDetector:
         classes: The model's own class names, in the order of their numbers.
         layout: What the output's columns mean, one of `yolo_decoding.LAYOUTS`.
         net_size: Width and height of the network's input, pixels.
+        looks: Sizes of the input for whole pictures and for racks, if the file asks for a second look; else None.
     """
 
     name = "yolo"
@@ -81,6 +83,9 @@ class YoloDetector:
         # `_recognise` refuses a model without names, with the number of names that it needs.
         self.classes: tuple[str, ...] = names or ()
         self._words = class_words(self.classes, class_map, str(model))
+        # One group for tubes, one for racks: a tube has one type, but a rack lies behind all of its tubes.
+        self._is_rack = np.array([word == RACK_CLASS for word in self._words])
+        self.looks = self._session.metadata.looks if self._session.any_size and image_size is None else None
 
     @property
     def words(self) -> tuple[str, ...]:
@@ -111,23 +116,36 @@ class YoloDetector:
         """
         image = to_8bit_rgb(image)
         size = (image.shape[1], image.shape[0])
-        yolox = self.layout.startswith("yolox")
-        letterbox = fit_letterbox(size, self.net_size, centred=not yolox)
-        tensor = to_tensor(letterbox.apply(image), yolox=yolox, dtype=self._session.dtype)
-        boxes = self._boxes(self._session.run(tensor))
-        edges = letterbox.to_image(boxes.edges_xyxy)
+        if self.looks is None:
+            boxes = self._look(image, self.net_size)
+        else:
+            boxes = look_twice(image, self._look_rectangular, self.looks, self._is_rack)
         found = []
-        for row in suppress(boxes, self._groups(boxes.class_ids), self._iou_threshold):
-            box = box_from_edges(edges[row], size)
+        for row in suppress(boxes, self._is_rack[boxes.class_ids].astype(np.intp), self._iou_threshold):
+            box = box_from_edges(boxes.edges_xyxy[row], size)
             if box is not None:
                 word = self._words[boxes.class_ids[row]]
                 found.append(Detection(word, float(boxes.scores[row]), box, self.name))
         return tuple(found)
 
-    def _boxes(self, outputs: list[NDArray[np.floating]]) -> RawBoxes:
+    def _look_rectangular(self, image: NDArray[np.uint8], long_side_px: int) -> RawBoxes:
+        """Boxes in pixels of a picture that is shown as large as the longer side says, without border."""
+        scale = long_side_px / max(image.shape[:2])
+        width, height = (SIZE_STEP * max(1, int(np.ceil(side * scale / SIZE_STEP))) for side in image.shape[1::-1])
+        return self._look(image, (width, height))
+
+    def _look(self, image: NDArray[np.uint8], net_size: tuple[int, int]) -> RawBoxes:
+        """One run of the network; boxes in pixels of the picture."""
+        yolox = self.layout.startswith("yolox")
+        letterbox = fit_letterbox((image.shape[1], image.shape[0]), net_size, centred=not yolox)
+        tensor = to_tensor(letterbox.apply(image), yolox=yolox, dtype=self._session.dtype)
+        boxes = self._boxes(self._session.run(tensor), net_size)
+        return RawBoxes(letterbox.to_image(boxes.edges_xyxy), boxes.scores, boxes.class_ids)
+
+    def _boxes(self, outputs: list[NDArray[np.floating]], net_size: tuple[int, int]) -> RawBoxes:
         path = self._session.path
         try:
-            boxes = decode(outputs[self._output_index][0], self.layout, self.net_size, self._score_threshold)
+            boxes = decode(outputs[self._output_index][0], self.layout, net_size, self._score_threshold)
         except DetectorError as problem:
             raise DetectorError(f"{path}: {problem}") from None
         if boxes.class_ids.size and boxes.class_ids.max() >= len(self.classes):
@@ -136,11 +154,6 @@ class YoloDetector:
                 f"{len(self.classes)} class names ({', '.join(self.classes)}); give all names in classes"
             )
         return boxes
-
-    def _groups(self, class_ids: NDArray[np.intp]) -> NDArray[np.intp]:
-        """One group for tubes, one for racks: a tube has one type, but a rack lies behind all of its tubes."""
-        is_rack = np.array([word == RACK_CLASS for word in self._words])
-        return is_rack[class_ids].astype(np.intp)
 
 
 def _check_thresholds(score_threshold: float, iou_threshold: float) -> None:

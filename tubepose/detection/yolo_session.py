@@ -11,11 +11,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from tubepose.detection.closer_look import Looks
 from tubepose.errors import DetectorError
 
 _INPUT_TYPES: dict[str, type[np.floating]] = {"tensor(float)": np.float32, "tensor(float16)": np.float16}
-# The coarsest usual stride: every level's grid must be whole.
-_SIZE_STEP = 32
+SIZE_STEP = 32
+"""The coarsest usual stride: every level's grid must be whole."""
 _DEFAULT_SIZE = 640
 
 
@@ -28,12 +29,14 @@ class ModelMetadata:
         image_size: Width and height of the network's input, pixels.
         final_boxes: True when the file says that suppression is part of the network.
         layout: A layout of `yolo_decoding.LAYOUTS`, as our own exports write it.
+        looks: How large the network is to see whole pictures and racks, if it was made to look at each rack again.
     """
 
     names: tuple[str, ...] | None
     image_size: tuple[int, int] | None
     final_boxes: bool
     layout: str | None
+    looks: Looks | None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -44,6 +47,7 @@ class YoloSession:
         path: The model file, for messages.
         metadata: What the file says about itself.
         net_size: Width and height of the input, pixels.
+        any_size: Whether it takes inputs of other sizes too.
         dtype: Type of the input values.
         runtime: The onnxruntime session.
     """
@@ -51,6 +55,7 @@ class YoloSession:
     path: Path
     metadata: ModelMetadata
     net_size: tuple[int, int]
+    any_size: bool
     dtype: type[np.floating]
     runtime: Any
 
@@ -90,7 +95,8 @@ def open_session(
     runtime = _start_runtime(path, providers, threads)
     metadata = _read_metadata(path, runtime.get_modelmeta().custom_metadata_map)
     net_size, dtype = _read_input(path, runtime.get_inputs(), metadata, image_size)
-    return YoloSession(path, metadata, net_size, dtype, runtime)
+    any_size = not any(isinstance(side, int) for side in runtime.get_inputs()[0].shape[2:])
+    return YoloSession(path, metadata, net_size, any_size, dtype, runtime)
 
 
 def _start_runtime(path: Path, providers: Sequence[str], threads: int | None) -> Any:
@@ -148,6 +154,7 @@ def _read_metadata(path: Path, entries: dict[str, str]) -> ModelMetadata:
         image_size=_metadata_size(path, _literal(path, entries, "imgsz")),
         final_boxes=entries.get("end2end") == "True" or (isinstance(arguments, dict) and arguments.get("nms") is True),
         layout=entries.get("layout"),
+        looks=_looks(path, _literal(path, entries, "looks")),
     )
 
 
@@ -188,6 +195,19 @@ def _metadata_size(path: Path, found: Any) -> tuple[int, int] | None:
     return int(sides[1]), int(sides[0])
 
 
+def _looks(path: Path, found: Any) -> Looks | None:
+    """Longer sides of the input for whole pictures and for racks."""
+    if found is None:
+        return None
+    sides = list(found) if isinstance(found, list | tuple) else []
+    if len(sides) != 2 or not all(isinstance(side, int) and side > 0 and side % SIZE_STEP == 0 for side in sides):
+        raise DetectorError(
+            f"{path}: metadata 'looks' is {found!r}, expected [whole, rack], multiples of {SIZE_STEP}; "
+            "export the model again"
+        )
+    return Looks(sides[0], sides[1])
+
+
 def _read_input(
     path: Path, inputs: list[Any], metadata: ModelMetadata, image_size: int | tuple[int, int] | None
 ) -> tuple[tuple[int, int], type[np.floating]]:
@@ -205,6 +225,6 @@ def _read_input(
     size = (sides[3] or wanted[0], sides[2] or wanted[1])
     if given is not None and given != size:
         raise DetectorError(f"{path}: image_size {given} given, but the model is made for {size}; leave image_size out")
-    if any(side <= 0 or side % _SIZE_STEP for side in size):
-        raise DetectorError(f"{path}: input of {size[0]} x {size[1]} pixels, expected multiples of {_SIZE_STEP}")
+    if any(side <= 0 or side % SIZE_STEP for side in size):
+        raise DetectorError(f"{path}: input of {size[0]} x {size[1]} pixels, expected multiples of {SIZE_STEP}")
     return size, _INPUT_TYPES[inputs[0].type]

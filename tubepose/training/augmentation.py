@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from tubepose.detection.evaluation import kinds_of
 from tubepose.detection.labelled_images import LabelledFiles
 from tubepose.detection.yolo_input import BORDER
 from tubepose.transforms import FloatArray
@@ -16,6 +17,8 @@ Image = NDArray[np.uint8]
 _KEPT_SHARE = 0.25
 """A box of which a crop leaves less than this is dropped."""
 _MIN_SIDE_PX = 4.0
+_LARGEST_SCALE = 2.5
+"""Nothing is blown up by more than this."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -33,23 +36,47 @@ class Sample:
     edges_xyxy: FloatArray
 
 
-def draw_sample(files: LabelledFiles, side_px: int, mosaic_share: float, rng: np.random.Generator) -> Sample:
+@dataclass(frozen=True, slots=True)
+class Views:
+    """How large a network is to see things.
+
+    Attributes:
+        whole_px: Longer side of a whole picture in the network's input.
+        rack_px: Longer side of a rack when the network looks at that rack alone.
+        rack_share: Chance of a sample at about the second scale, where a picture shows a rack.
+    """
+
+    whole_px: int
+    rack_px: int
+    rack_share: float
+
+
+def draw_sample(
+    files: LabelledFiles, side_px: int, mosaic_share: float, views: Views, rng: np.random.Generator
+) -> Sample:
     """A square sample: a crop of one picture, or four crops of four pictures side by side.
 
     Args:
         files: Where to draw from.
         side_px: Side of the sample.
         mosaic_share: Chance of four pictures.
+        views: How large things are.
         rng: Source of randomness.
     """
+    racks = np.array([kind == "rack" for kind in kinds_of(files.classes, {}).values()])
+
+    def crop(width: int, height: int) -> Sample:
+        sample = _turned(_read(files, rng), rng)
+        return _crop(sample, (width, height), _scale(sample, max(width, height), racks, views, rng), rng)
+
     if rng.uniform() >= mosaic_share:
-        return look_other(_crop(_read(files, rng), (side_px, side_px), rng), rng)
+        return look_other(crop(side_px, side_px), rng)
     at_x, at_y = (round(side_px * value) for value in rng.uniform(0.3, 0.7, 2))
     canvas = np.full((side_px, side_px, 3), BORDER, np.uint8)
     ids, edges = [], []
     for x0, x1 in ((0, at_x), (at_x, side_px)):
         for y0, y1 in ((0, at_y), (at_y, side_px)):
-            tile = _crop(_read(files, rng), (x1 - x0, y1 - y0), rng)
+            tile = crop(x1 - x0, y1 - y0)
             canvas[y0:y1, x0:x1] = tile.image
             ids.append(tile.class_ids)
             edges.append(tile.edges_xyxy + np.array([x0, y0, x0, y0]))
@@ -63,27 +90,45 @@ def _read(files: LabelledFiles, rng: np.random.Generator) -> Sample:
     return Sample(image, ids, edges)
 
 
-def _crop(sample: Sample, size: tuple[int, int], rng: np.random.Generator) -> Sample:
-    """A part of a picture at a random scale and maybe turned by quarters or mirrored, of a given width and height."""
-    sample = _turned(sample, rng)
-    height, width = sample.image.shape[:2]
-    scale = float(np.exp(rng.uniform(np.log(0.5), np.log(1.4))))
-    if rng.uniform() < 0.25:  # the whole picture, so that large things are seen whole
-        scale = min(scale, max(size) / max(width, height))
+def _scale(sample: Sample, side_px: int, racks: NDArray[np.bool_], views: Views, rng: np.random.Generator) -> float:
+    """Sample's pixels per picture's pixel: about those of a rack looked at alone, or of a whole picture."""
+    longest = max(sample.image.shape[:2])
+    sides = np.ptp(sample.edges_xyxy[racks[sample.class_ids]].reshape(-1, 2, 2), axis=1).max(axis=1)
+    if len(sides) and rng.uniform() < views.rack_share:
+        wanted = views.rack_px * float(np.exp(rng.uniform(np.log(0.6), np.log(1.2))))
+        return float(min(wanted / rng.choice(sides), _LARGEST_SCALE))
+    scale = views.whole_px / longest * float(np.exp(rng.uniform(np.log(0.5), np.log(1.4))))
+    # Now and then the whole picture, so that large things are seen whole.
+    return float(min(scale, side_px / longest)) if rng.uniform() < 0.25 else scale
+
+
+def _crop(sample: Sample, size: tuple[int, int], scale: float, rng: np.random.Generator) -> Sample:
+    """A part of a picture at about a scale, of a given width and height."""
     squeeze = float(np.exp(rng.normal(0.0, 0.06)))
     scales = np.array([scale * squeeze, scale / squeeze])
-    free = np.array([width, height]) * scales - np.array(size)
+    free = np.array(sample.image.shape[1::-1]) * scales - np.array(size)
     middle = rng.uniform(0.0, 1.0, 2) * free
-    if len(sample.edges_xyxy) and rng.uniform() < 0.7:  # around some object
+    if len(sample.edges_xyxy) and rng.uniform() < 0.85:  # around some object
         box = sample.edges_xyxy[int(rng.integers(len(sample.edges_xyxy)))].reshape(2, 2).mean(axis=0)
         middle = np.clip(box * scales - rng.uniform(0.1, 0.9, 2) * size, np.minimum(free, 0), np.maximum(free, 0))
-    matrix = np.array([[scales[0], 0, -middle[0]], [0, scales[1], -middle[1]]])
-    source = sample.image
-    if scale < 0.8:  # a picture that is warped down without this gets jagged edges
-        source = np.asarray(cv2.GaussianBlur(source, (0, 0), 0.35 / scale), np.uint8)
-    image = cv2.warpAffine(source, matrix, size, flags=cv2.INTER_LINEAR, borderValue=(BORDER,) * 3)
+    image = _shown(sample.image, scales, middle, size)
     edges = sample.edges_xyxy * np.tile(scales, 2) - np.tile(middle, 2)
-    return _cut(Sample(np.asarray(image, np.uint8), sample.class_ids, edges), size)
+    return _cut(Sample(image, sample.class_ids, edges), size)
+
+
+def _shown(source: Image, scales: FloatArray, corner: FloatArray, size: tuple[int, int]) -> Image:
+    """The part of a picture, scaled, whose left top corner is at `corner` of the scaled picture."""
+    margin = np.ceil(4 / scales)
+    low = np.maximum(np.floor(corner / scales - margin), 0).astype(int)
+    high = np.maximum(np.ceil((corner + np.array(size)) / scales + margin).astype(int), low + 1)
+    part = source[low[1] : high[1], low[0] : high[0]]
+    if not part.size:
+        return np.full((size[1], size[0], 3), BORDER, np.uint8)
+    if scales.min() < 0.8:  # a picture that is warped down without this gets jagged edges
+        part = np.asarray(cv2.GaussianBlur(part, (0, 0), 0.35 / float(scales.min())), np.uint8)
+    shift = low * scales - corner
+    matrix = np.array([[scales[0], 0, shift[0]], [0, scales[1], shift[1]]])
+    return np.asarray(cv2.warpAffine(part, matrix, size, flags=cv2.INTER_LINEAR, borderValue=(BORDER,) * 3), np.uint8)
 
 
 def _cut(sample: Sample, size: tuple[int, int]) -> Sample:

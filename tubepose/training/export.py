@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from tubepose import __version__
+from tubepose.detection.closer_look import Looks
 from tubepose.report import write_aside
 
 if TYPE_CHECKING:
@@ -27,12 +28,12 @@ def export_onnx(
     network: torch.nn.Module,
     path: Path,
     classes: Sequence[str],
-    side_px: int,
+    looks: Looks,
     recipe: Mapping[str, Any],
     *,
     sha256: str,
 ) -> None:
-    """Write a network of `build_network` as ONNX: input and output as YOLOX's, boxes decoded, weights in 16 bits.
+    """Write a network of `build_network` as ONNX: input of any size and output as YOLOX's, weights in 16 bits.
 
     The input is BGR from 0 to 255 with the border right and below, as YOLOX has it; values and arithmetic have 32
     bits, only the stored weights are halved.
@@ -41,7 +42,7 @@ def export_onnx(
         network: The network; it is not changed.
         path: The .onnx file.
         classes: Class names in the order of their numbers.
-        side_px: Side of the input.
+        looks: How large it is to see whole pictures and racks.
         recipe: How it was trained, for its metadata.
         sha256: Fingerprint of that.
     """
@@ -49,6 +50,7 @@ def export_onnx(
     import torch
 
     net = copy.deepcopy(network).cpu().eval().to(memory_format=torch.contiguous_format)
+    net.head.decode_in_inference = False  # boxes are decoded outside: the grid depends on the input's size
     stem: Any = net.backbone.backbone.stem[0]
     with torch.no_grad():
         stem.weight.copy_(stem.weight.flip(1).clone())
@@ -58,10 +60,11 @@ def export_onnx(
             warnings.simplefilter("ignore")
             torch.onnx.export(
                 net,
-                (torch.zeros(1, 3, side_px, side_px),),
+                (torch.zeros(1, 3, looks.rack_px, looks.rack_px),),
                 str(aside),
                 input_names=["images"],
                 output_names=["output"],
+                dynamic_axes={"images": {2: "height", 3: "width"}, "output": {1: "rows"}},
                 opset_version=_OPSET,
                 dynamo=False,
             )
@@ -70,9 +73,10 @@ def export_onnx(
         described = {
             "task": "detect",
             "names": repr(dict(enumerate(classes))),
-            "imgsz": repr([side_px, side_px]),
+            "imgsz": repr([looks.rack_px, looks.rack_px]),
+            "looks": repr([looks.whole_px, looks.rack_px]),
             "stride": "32",
-            "layout": "yolox-decoded",
+            "layout": "yolox",
             "color_order": "BGR",
             "value_range": "0..255",
             "enhancement": "none",

@@ -19,7 +19,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from tubepose.detection.labelled_images import LabelledFiles
 from tubepose.errors import DetectorError
 from tubepose.report import write_aside
-from tubepose.training.augmentation import draw_sample
+from tubepose.training.augmentation import Views, draw_sample
 from tubepose.training.network import build_network
 
 if TYPE_CHECKING:
@@ -38,6 +38,9 @@ class Recipe(BaseModel):
         side_px: Side of a sample for most of the time; every batch differs from it by up to a fifth.
         late_side_px: Side for the last part, without mosaics: the size of things as they will be met.
         late_share: How long that part is, as a share of the steps.
+        whole_px: Longer side of a whole picture as the network will see it.
+        rack_px: Longer side of a rack as the network will see it when it looks at that rack alone.
+        rack_share: Share of the samples that are at about that scale.
         rate: Largest learning rate of what starts from nothing; the backbone learns at a tenth of it.
         weight_decay: Of AdamW.
         frozen_blocks: Leading blocks of the backbone that keep what they learned on photographs.
@@ -53,6 +56,9 @@ class Recipe(BaseModel):
     side_px: int = Field(default=384, ge=96, multiple_of=32)
     late_side_px: int = Field(default=544, ge=96, multiple_of=32)
     late_share: float = Field(default=0.2, ge=0, le=1)
+    whole_px: int = Field(default=512, ge=96)
+    rack_px: int = Field(default=552, ge=64)
+    rack_share: float = Field(default=0.5, ge=0, le=1)
     rate: float = Field(default=1e-3, gt=0)
     weight_decay: float = Field(default=0.02, ge=0)
     frozen_blocks: int = Field(default=3, ge=0, le=16)
@@ -141,7 +147,8 @@ class Trainer:
         side = max(96, 32 * round(base * rng.uniform(0.8, 1.2) / 32))
         count = max(1, round(recipe.batch * min(1.0, (recipe.side_px / side) ** 2)))
         mosaic = 0.0 if late else recipe.mosaic_share
-        samples = [draw_sample(self.files, side, mosaic, rng) for _ in range(count)]
+        views = Views(recipe.whole_px, recipe.rack_px, recipe.rack_share)
+        samples = [draw_sample(self.files, side, mosaic, views, rng) for _ in range(count)]
         most = max(1, *(len(sample.class_ids) for sample in samples))
         labels = np.zeros((count, most, 5), np.float32)
         for row, sample in zip(labels, samples, strict=True):

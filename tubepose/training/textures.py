@@ -129,8 +129,22 @@ def coded(rng: np.random.Generator) -> Float32Array:
     return np.asarray(np.repeat((0.04 + 0.8 * big)[..., None], 3, axis=2), np.float32)
 
 
+def washers(rng: np.random.Generator) -> Float32Array:
+    """Discs within discs, scattered: coins, lids, washers, printed targets; round, and no tubes."""
+    picture = np.ascontiguousarray(np.round(plain(rng) * 255), np.uint8)
+    largest = int(rng.integers(6, 60))
+    for _ in range(int(rng.integers(3, 40))):
+        at = tuple(int(value) for value in rng.integers(0, SIZE, 2))
+        radius = float(rng.uniform(0.4, 1.0)) * largest
+        for _ in range(int(rng.integers(1, 6))):
+            color = tuple(round(255 * value) for value in random_color(rng, vivid=0.4))
+            cv2.circle(picture, at, max(1, round(radius)), color, -1, cv2.LINE_AA)
+            radius *= float(rng.uniform(0.4, 0.92))
+    return np.asarray(picture, np.float32) / np.float32(255)
+
+
 GROUNDS: tuple[Callable[[np.random.Generator], Float32Array], ...] = (
-    plain, plain, marbled, grained, speckled, tiled, dotted, collage,
+    plain, plain, marbled, grained, speckled, tiled, dotted, collage, washers,
 )  # fmt: skip
 """What a table or a wall may look like; plain ones come twice as often."""
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,9 +12,11 @@ from pathlib import Path
 import cv2
 import yaml
 
+from tubepose.detection.closer_look import Looks
 from tubepose.detection.evaluation import DetectionReport, evaluate_detector, kinds_of
 from tubepose.detection.labelled_images import LabelledFiles
 from tubepose.detection.yolo import YoloDetector
+from tubepose.detection.yolo_session import SIZE_STEP
 from tubepose.errors import DetectorError
 from tubepose.report import write_aside, write_bytes, write_json
 from tubepose.training.export import export_onnx
@@ -38,7 +41,7 @@ class TrainingJob:
         out: The .onnx file.
         work: Folder for the checkpoint and for what there is to look at.
         recipe: How to train.
-        side_px: Side of the network's input, once trained.
+        looks: How large the trained network is to see whole pictures and racks.
         threads: Processor threads.
         start: Checkpoint of another training to start from; None for the photographs' weights alone.
     """
@@ -47,7 +50,7 @@ class TrainingJob:
     out: Path
     work: Path
     recipe: Recipe
-    side_px: int
+    looks: Looks
     threads: int
     start: Path | None = None
 
@@ -67,18 +70,23 @@ def train_detector(
     Raises:
         DetectorError: A package is missing, the pictures cannot be read, or the checkpoint belongs to another training.
     """
-    if job.side_px % 32 or job.side_px < 96:
-        raise DetectorError(f"side {job.side_px}: expected a multiple of 32, 96 or more")
+    for side in (job.looks.whole_px, job.looks.rack_px):
+        if side % SIZE_STEP or side < 96:
+            raise DetectorError(f"side {side}: expected a multiple of {SIZE_STEP}, 96 or more")
     trainer = Trainer(job.recipe, job.files, job.work, threads=job.threads, start=job.start)
     trainer.run(on_step)
-    record = {"recipe": job.recipe.model_dump(), "images": _source(job.files), "input_px": job.side_px}
+    record = {
+        "recipe": job.recipe.model_dump(),
+        "images": _sources(job.files),
+        "looks_px": [job.looks.whole_px, job.looks.rack_px],
+    }
     if trainer.start_sha256:
         record["start_sha256"] = trainer.start_sha256
     export_onnx(
         trainer.average.module,
         job.out,
         job.files.classes,
-        job.side_px,
+        job.looks,
         record,
         sha256=hashlib.sha256(json.dumps(record, sort_keys=True).encode()).hexdigest(),
     )
@@ -98,8 +106,12 @@ def judge(model: Path, files: LabelledFiles, work: Path, *, threads: int) -> Det
     return report
 
 
-def _source(files: LabelledFiles) -> dict[str, object]:
-    """What the pictures were drawn from, where they say it."""
-    said = files.images[0].parent.parent / RECIPE_FILE
-    drawn = yaml.safe_load(said.read_text(encoding="utf-8")) if said.is_file() else {"labelled_by": "the user"}
-    return {"count": len(files.images), **drawn}
+def _sources(files: LabelledFiles) -> list[dict[str, object]]:
+    """What the pictures were drawn from, where they say it: one entry a folder."""
+    counts = Counter(image.parent.parent for image in files.images)
+    sources = []
+    for folder, count in counts.items():
+        said = folder / RECIPE_FILE
+        drawn = yaml.safe_load(said.read_text(encoding="utf-8")) if said.is_file() else {"labelled_by": "the user"}
+        sources.append({"count": count, **drawn})
+    return sources
