@@ -40,8 +40,8 @@ class Looks:
 def look_twice(image: NDArray[np.uint8], look: Look, looks: Looks, is_rack: NDArray[np.bool_]) -> RawBoxes:
     """Boxes of a picture: racks and what lies outside of them from the whole, a rack's tubes from that rack's picture.
 
-    A picture without a rack, or with something like a tube outside of its racks, is looked at as a whole again, as large
-    as a rack would be.
+    A picture without a rack, or with something like a tube outside of its racks, is looked at as a whole again, as
+    large as a rack would be.
 
     Args:
         image: RGB, shape (H, W, 3).
