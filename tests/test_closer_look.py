@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from onnx import helper, numpy_helper
-from test_yolo import METADATA, save
+from test_yolo import METADATA, TABLES, constant_model, save
 
 from tubepose.detection.closer_look import LEAST_SCORE, MARGIN, MOST_RACKS, Looks, look_twice
 from tubepose.detection.yolo import YoloDetector
@@ -157,7 +157,5 @@ def test_looks_that_make_no_sense_are_refused(tmp_path, looks):
 
 
 def test_a_model_of_one_size_looks_once(tmp_path):
-    from test_yolo import TABLES, constant_model
-
     path = constant_model(tmp_path / "m.onnx", TABLES["yolov8"], metadata=METADATA | {"looks": "[64, 128]"})
     assert YoloDetector(path).looks is None

@@ -59,8 +59,7 @@ class AssistedDetector:
 
         A tube that both see keeps the network's box, class and score; if the network is unsure of it, it gets the
         points of the cloud's tube: a box that is off would cut some away. A tube of the cloud without a box of its
-        own is added. A tube's box without
-        a tube of the cloud stays if the network is sure of it.
+        own is added. A tube's box without a tube of the cloud stays if the network is sure of it.
 
         Args:
             frame: The frame.

@@ -55,11 +55,13 @@ def look_twice(image: NDArray[np.uint8], look: Look, looks: Looks, is_rack: NDAr
     if not len(racks):
         return look(image, looks.rack_px)
     chosen = whole.edges_xyxy[racks]
-    if (_outside(whole, chosen, is_rack) & (whole.scores >= LEAST_TUBE_SCORE)).any():
+    # What stands half way into the margin is seen whole in its rack's picture; the rest may be cut by its border.
+    inner = [_widened(box, 0.5) for box in chosen]
+    if (_outside(whole, inner, is_rack) & (whole.scores >= LEAST_TUBE_SCORE)).any():
         larger = look(image, looks.rack_px)
         whole = _joined([_rows(whole, is_rack[whole.class_ids]), _rows(larger, ~is_rack[larger.class_ids])])
-    kept = [_rows(whole, is_rack[whole.class_ids] | _outside(whole, chosen, is_rack))]
-    for box in chosen:
+    kept = [_rows(whole, is_rack[whole.class_ids] | _outside(whole, inner, is_rack))]
+    for box, own in zip(chosen, inner, strict=True):
         wide = _widened(box, 1.0)
         corner = np.maximum(np.floor(wide[:2]), 0).astype(int)
         end = np.minimum(np.ceil(wide[2:]), image.shape[1::-1]).astype(int)
@@ -68,8 +70,7 @@ def look_twice(image: NDArray[np.uint8], look: Look, looks: Looks, is_rack: NDAr
             continue
         found = look(part, looks.rack_px)
         moved = RawBoxes(found.edges_xyxy + np.tile(corner, 2), found.scores, found.class_ids)
-        # What stands half way into the margin is seen whole; the rest may be cut by the part's border.
-        kept.append(_rows(moved, ~is_rack[moved.class_ids] & _centred_in(moved.edges_xyxy, _widened(box, 0.5))))
+        kept.append(_rows(moved, ~is_rack[moved.class_ids] & _centred_in(moved.edges_xyxy, own)))
     return _joined(kept)
 
 
@@ -79,9 +80,9 @@ def _widened(box: FloatArray, share: float) -> FloatArray:
     return np.concatenate([box[:2] - more, box[2:] + more])
 
 
-def _outside(boxes: RawBoxes, racks_xyxy: FloatArray, is_rack: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Which boxes are tubes that no rack's own picture tells of."""
-    inside = [_centred_in(boxes.edges_xyxy, _widened(box, 0.5)) for box in racks_xyxy]
+def _outside(boxes: RawBoxes, inner: Sequence[FloatArray], is_rack: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Which boxes are tubes that no rack's own picture tells of; `inner`: what each of those tells of."""
+    inside = [_centred_in(boxes.edges_xyxy, box) for box in inner]
     return np.asarray(~is_rack[boxes.class_ids] & ~np.any(inside, axis=0))
 
 
