@@ -37,7 +37,7 @@ def loss_curve(losses: Sequence[Sequence[float]]) -> bytes:
         axes.plot(table[width - 1 :, 0], smooth, label=name, linewidth=1.2)
     axes.set(xlabel="step", ylabel=f"loss, mean of {width} steps", yscale="log")
     axes.grid(alpha=0.3)
-    axes.legend(frameon=False)
+    figure.legend(frameon=False, loc="outside right upper")
     buffer = io.BytesIO()
     figure.savefig(buffer, format="png", dpi=120, metadata={"Software": None})
     return buffer.getvalue()
