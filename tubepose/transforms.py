@@ -47,10 +47,17 @@ def axis_rotation(axis: FloatArray) -> FloatArray:
     Args:
         axis: Array of shape (3,), rack frame; normalised here.
     """
-    x, y, z = np.asarray(axis, dtype=float) / np.linalg.norm(axis)
-    alpha = float(np.arctan2(-y, np.hypot(x, z)))
-    beta = float(np.arctan2(x, z))
-    return tilt_rotation(alpha, beta)
+    return np.asarray(axis_rotations(np.asarray(axis, dtype=float)[None])[0])
+
+
+def axis_rotations(axes: FloatArray) -> FloatArray:
+    """`axis_rotation` of many axes (N, 3) at once, shape (N, 3, 3)."""
+    x, y, z = (axes / np.linalg.norm(axes, axis=1, keepdims=True)).T
+    flat = np.hypot(x, z)
+    # An axis along y has no part in the x-z plane, and no turn about y.
+    cos, sin = np.where(flat > 0, z, 1.0) / np.where(flat > 0, flat, 1.0), x / np.where(flat > 0, flat, 1.0)
+    zero = np.zeros_like(x)
+    return np.asarray(np.stack([cos, -sin * y, x, zero, flat, y, -sin, -cos * y, z], axis=1).reshape(-1, 3, 3))
 
 
 def quaternion_wxyz(T: FloatArray) -> tuple[float, float, float, float]:

@@ -13,13 +13,14 @@ from tubepose.config import Config, ProfileConfig
 from tubepose.labware import RackModel, TubeModel
 from tubepose.preprocessing import TALLEST_TUBE_M
 from tubepose.profile.floor import SETTLED_MM, settle_floor
+from tubepose.profile.kernels import grouped
 from tubepose.profile.leftovers import Leftover, find_leftovers
 from tubepose.profile.measure import Measured, measure_tops
 from tubepose.profile.posterior import FEW_SAMPLES, Evidence, Posterior, combine, evidence, per_model
 from tubepose.profile.standing import Standing, gather_standing
 from tubepose.profile.verdict import rejection, score
 from tubepose.profile.wall import wall_evidence
-from tubepose.transforms import FloatArray, axis_rotation, make_transform
+from tubepose.transforms import FloatArray, axis_rotations
 from tubepose.tube import TubePose, TubeStatus
 
 
@@ -80,9 +81,9 @@ def fit_profiles(
     rise = _rise_m(measured, models, rack, config.profile)
     clouds = _clouds(measured, len(models))
     found = []
-    for i, tube in enumerate(models):
+    poses = _poses(measured, posterior, covariance, rise, clouds, models, rack, config.profile)
+    for i, (tube, pose) in enumerate(zip(models, poses, strict=True)):
         slot = rack.all_slots[measured.tops.slot[i]]
-        pose = _pose(i, measured, posterior, covariance[i], float(rise[i]), tube, rack, config.profile, len(clouds[i]))
         crowd = next((left.reason for left in leftovers if left.slot == measured.tops.slot[i]), "")
         if crowd and pose.status is TubeStatus.OK:
             pose = _rejected(pose, f"two tubes in one slot: {crowd}")
@@ -92,9 +93,7 @@ def fit_profiles(
 
 def _clouds(measured: Measured, count: int) -> list[FloatArray]:
     """The points of every tube, shape (N, 3) each."""
-    label = measured.label.astype(np.int16)
-    ordered = measured.points.points_m[np.argsort(label, kind="stable")]
-    ends = np.cumsum(np.bincount(label + 1, minlength=count + 1))
+    ordered, ends = grouped(measured.points.points_m, measured.label, count)
     return [ordered[ends[i] : ends[i + 1]] for i in range(count)]
 
 
@@ -160,8 +159,7 @@ def pose_covariance(
     shifts the bottom, and turns the axis by that shift over the distance between them.
     """
     count = len(models)
-    held = per_model(models, lambda tube: tube.pivot_height_m)
-    height = per_model(models, lambda tube: tube.height_m)
+    held, height = per_model(models, lambda tube: (tube.pivot_height_m, tube.height_m)).reshape(-1, 2).T
     J = np.zeros((count, 5, 4))
     J[:, 0, 3], J[:, 1, 2] = -1.0, 1.0
     J[:, [2, 3], [0, 1]] = 1.0
@@ -183,42 +181,53 @@ def pose_covariance(
     return np.asarray(covariance + np.einsum("tij,jk,tlk->til", chain, rack_covariance, chain))
 
 
-def _pose(
-    i: int,
+def _poses(
     measured: Measured,
     posterior: Posterior,
     covariance: FloatArray,
-    rise_m: float,
-    tube: TubeModel,
+    rise_m: FloatArray,
+    clouds: Sequence[FloatArray],
+    models: Sequence[TubeModel],
     rack: RackModel,
     config: ProfileConfig,
-    n_points: int,
-) -> TubePose:
-    """Pose and verdict of one tube."""
-    u, v, a, b = posterior.mean[i]
-    slot = rack.all_slots[measured.tops.slot[i]]
-    axis = np.array([a, b, 1.0]) / np.sqrt(1 + a * a + b * b)
-    held = tube.pivot_height_m
-    x, y = slot.center_m
-    bottom = np.array([x + u, y + v, rack.floor_m + held + rise_m]) - held * axis
-    tilt_std = float(np.sqrt(np.trace(covariance[:2, :2])))
-    high = float(measured.planes.height_m[i] - rack.floor_m - tube.height_m)
-    sectors, allowed = float(measured.circles.sectors[i]), float(posterior.allowed[i])
-    reason = rejection(
-        sectors=sectors, allowed=allowed, high_m=high, tilt_std_rad=tilt_std, tube=tube, rack=rack, slot=slot.name,
-        config=config, looked_at=not tube.is_open or bool(np.isfinite(measured.circles.widening_m[i])),
-        runner_up=float(measured.tops.runner_up[i] / measured.tops.support[i]),
-    )  # fmt: skip
-    return TubePose(
-        TubeStatus.REJECTED if reason else TubeStatus.OK,
-        reason,
-        make_transform(axis_rotation(axis), bottom),
-        score=score(tilt_std, sectors, allowed, config),
-        inlier_rmse_m=float(measured.planes.rms_m[i]),
-        fitness=sectors,
-        n_points=n_points,
-        covariance=covariance,
-    )
+) -> list[TubePose]:
+    """Pose and verdict of every tube."""
+    tops, circles = measured.tops, measured.circles
+    held, height, is_open = per_model(
+        models, lambda tube: (tube.pivot_height_m, tube.height_m, tube.is_open)
+    ).reshape(-1, 3).T  # fmt: skip
+    axis = np.column_stack([posterior.mean[:, 2:], np.ones(len(models))])
+    axis /= np.linalg.norm(axis, axis=1, keepdims=True)
+    foot = np.column_stack([rack.slot_centers_m[tops.slot] + posterior.mean[:, :2], rack.floor_m + held + rise_m])
+    T = np.tile(np.eye(4), (len(models), 1, 1))
+    T[:, :3, :3], T[:, :3, 3] = axis_rotations(axis), foot - held[:, None] * axis
+    tilt_std = np.sqrt(covariance[:, 0, 0] + covariance[:, 1, 1])
+    verdicts = {
+        "sectors": circles.sectors,
+        "allowed": posterior.allowed,
+        "high_m": measured.planes.height_m - rack.floor_m - height,
+        "tilt_std_rad": tilt_std,
+        "looked_at": (is_open == 0) | np.isfinite(circles.widening_m),
+        "runner_up": tops.runner_up / tops.support,
+    }
+    columns = [values.tolist() for values in verdicts.values()]
+    found = []
+    for i, (tube, *values) in enumerate(zip(models, *columns, strict=True)):
+        said = dict(zip(verdicts, values, strict=True))
+        reason = rejection(**said, tube=tube, rack=rack, slot=rack.all_slots[tops.slot[i]].name, config=config)
+        found.append(
+            TubePose(
+                TubeStatus.REJECTED if reason else TubeStatus.OK,
+                reason,
+                T[i],
+                score=score(said["tilt_std_rad"], said["sectors"], said["allowed"], config),
+                inlier_rmse_m=float(measured.planes.rms_m[i]),
+                fitness=said["sectors"],
+                n_points=len(clouds[i]),
+                covariance=covariance[i],
+            )
+        )
+    return found
 
 
 def _rejected(pose: TubePose, reason: str) -> TubePose:

@@ -52,6 +52,79 @@ def level_pictures(points_m, step, camera_m, level_m, below_m, above_m, half_m, 
 
 
 @njit(cache=True)
+def best_places(score, low, high, wanted, close, near):
+    """Best score in every wanted window [low, high) of a picture, and its place in cells: shape (S, 3).
+
+    Several cells are as good: the place is the middle of those `close` to the best score and `near` its first cell.
+    Windows are cut at the picture's edge; -inf where nothing is left of one or it is not wanted.
+    """
+    found = np.full((len(low), 3), -np.inf)
+    for s in range(len(low)):
+        if not wanted[s]:
+            continue
+        peak, first_i, first_j = -np.inf, 0, 0
+        i_low, i_high = max(low[s, 0], 0), min(high[s, 0], score.shape[0])
+        j_low, j_high = max(low[s, 1], 0), min(high[s, 1], score.shape[1])
+        for i in range(i_low, i_high):
+            for j in range(j_low, j_high):
+                if score[i, j] > peak:
+                    peak, first_i, first_j = score[i, j], i, j
+        if peak == -np.inf:
+            continue
+        least = np.float32(peak - close)
+        count, sum_i, sum_j = 0, 0, 0
+        for i in range(i_low, i_high):
+            for j in range(j_low, j_high):
+                if score[i, j] >= least and math.hypot(i - first_i, j - first_j) < near:
+                    count += 1
+                    sum_i += i
+                    sum_j += j
+        found[s, 0], found[s, 1], found[s, 2] = peak, sum_i / count, sum_j / count
+    return found
+
+
+@njit(cache=True)
+def nearest_tops(centers_m, radii_m, near_m, low_m, cell_m, shape):
+    """Top whose middle is nearest to each cell of a picture (X, Y) whose cell 0, 0 lies at `low_m`; -1 outside of all.
+
+    Outside is what is farther than `near_m` from the end of every top.
+    """
+    label = np.full((shape[0], shape[1]), -1, np.intp)
+    nearest = np.full((shape[0], shape[1]), np.inf)
+    for t in range(len(centers_m)):
+        reach = radii_m[t] + near_m
+        cells = int(reach / cell_m) + 2
+        i, j = int((centers_m[t, 0] - low_m[0]) / cell_m), int((centers_m[t, 1] - low_m[1]) / cell_m)
+        for a in range(max(i - cells, 0), min(i + cells + 1, shape[0])):
+            x = low_m[0] + a * cell_m - centers_m[t, 0]
+            for b in range(max(j - cells, 0), min(j + cells + 1, shape[1])):
+                y = low_m[1] + b * cell_m - centers_m[t, 1]
+                distance = math.sqrt(x * x + y * y)
+                if distance < reach and distance < nearest[a, b]:
+                    nearest[a, b], label[a, b] = distance, t
+    return label
+
+
+@njit(cache=True)
+def grouped(points_m, label, count):
+    """Points (N, 3) ordered by their labels from 0 to count - 1, those without one left out, and where each ends."""
+    ends = np.zeros(count + 1, np.intp)
+    for k in range(len(label)):
+        if label[k] >= 0:
+            ends[label[k] + 1] += 1
+    ends = np.cumsum(ends)
+    free = ends[:-1].copy()
+    ordered = np.empty((ends[-1], 3))
+    for k in range(len(label)):
+        t = label[k]
+        if t >= 0:
+            for i in range(3):
+                ordered[free[t], i] = points_m[k, i]
+            free[t] += 1
+    return ordered, ends
+
+
+@njit(cache=True)
 def cell_values(points_m, low_m, cell_m, picture):
     """Values (N,) of the cells of points in a picture (X, Y) whose cell 0, 0 lies at `low_m`; the border is outside."""
     values = np.empty(len(points_m), picture.dtype)
@@ -145,17 +218,38 @@ def plane_sums(label, offset_m, height_m, expected_m, band_m, radius_m, planes, 
 
 
 @njit(cache=True)
+def sector_of(x, y, tangents):
+    """Sector of a direction, counted from -x over -y: four times one more than there are tangents of their borders."""
+    x, y = -x, -y
+    if x > 0.0 and y >= 0.0:
+        quarter = 0
+    elif x <= 0.0 and y > 0.0:
+        quarter, x, y = 1, y, -x
+    elif x < 0.0 and y <= 0.0:
+        quarter, x, y = 2, -x, -y
+    else:
+        quarter, x, y = 3, -y, x
+    sector = quarter * (len(tangents) + 1)
+    for tangent in tangents:
+        sector += y >= tangent * x
+    return sector
+
+
+@njit(cache=True)
 def sector_counts(label, offset_m, shift_m, lower_m, low_m, high_m, sectors):
-    """Points of every tube and sector between `lower` and `low`, and between `low` and `high`: two (T, sectors)."""
+    """Points of every tube and sector between `lower` and `low`, and between `low` and `high`: two (T, sectors).
+
+    The sectors, four or a multiple of it, are counted from -x over -y.
+    """
     core = np.zeros((len(low_m), sectors), np.intp)
     edge = np.zeros((len(low_m), sectors), np.intp)
-    scale = sectors / (2.0 * math.pi)
+    tangents = np.tan(np.arange(1, sectors // 4) * (2.0 * math.pi / sectors))
     for k in range(len(label)):
         t = label[k]
         x, y = offset_m[k, 0] - shift_m[t, 0], offset_m[k, 1] - shift_m[t, 1]
         rho = math.sqrt(x * x + y * y)
         if lower_m[t] < rho <= high_m[t]:
-            sector = int((math.atan2(y, x) + math.pi) * scale) % sectors
+            sector = sector_of(x, y, tangents)
             if rho <= low_m[t]:
                 core[t, sector] += 1
             else:
@@ -173,19 +267,23 @@ def radial_brightness(
     outside of it those of its border count.
     """
     height, width = picture.shape
+    fx, fy, cx, cy = camera[0], camera[1], camera[2], camera[3]
     values = np.zeros((len(centers_m), sectors, len(steps_m)))
+    middle, outwards = np.empty(3), np.empty(3)
     for t in range(len(centers_m)):
+        for i in range(3):
+            row = rotation[i]
+            middle[i] = row[0] * centers_m[t, 0] + row[1] * centers_m[t, 1] + row[2] * levels_m[t] + translation_m[i]
         for a in range(sectors * per_sector):
             angle = (a + 0.5) / (sectors * per_sector) * 2.0 * math.pi - math.pi
             cos, sin = math.cos(angle), math.sin(angle)
+            for i in range(3):
+                outwards[i] = rotation[i, 0] * cos + rotation[i, 1] * sin
             for b in range(len(steps_m)):
                 r = radii_m[t] + steps_m[b]
-                x, y, z = centers_m[t, 0] + r * cos, centers_m[t, 1] + r * sin, levels_m[t]
-                depth = rotation[2, 0] * x + rotation[2, 1] * y + rotation[2, 2] * z + translation_m[2]
-                right = rotation[0, 0] * x + rotation[0, 1] * y + rotation[0, 2] * z + translation_m[0]
-                down = rotation[1, 0] * x + rotation[1, 1] * y + rotation[1, 2] * z + translation_m[1]
-                u = min(max(camera[0] * right / depth + camera[2], 0.0), width - 1.001)
-                v = min(max(camera[1] * down / depth + camera[3], 0.0), height - 1.001)
+                nearness = 1.0 / (middle[2] + r * outwards[2])
+                u = min(max(fx * (middle[0] + r * outwards[0]) * nearness + cx, 0.0), width - 1.001)
+                v = min(max(fy * (middle[1] + r * outwards[1]) * nearness + cy, 0.0), height - 1.001)
                 i, j = int(v), int(u)
                 dv, du = v - i, u - j
                 upper = picture[i, j] * (1.0 - du) + picture[i, j + 1] * du

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from tubepose.capture.frame import CameraIntrinsics, RgbdFrame
 from tubepose.config import Config, ProfileConfig
 from tubepose.labware import RackModel, TubeModel
-from tubepose.profile.kernels import cell_values, ends_on_planes, near_planes
+from tubepose.profile.kernels import cell_values, ends_on_planes, near_planes, nearest_tops
 from tubepose.profile.outline import NORMALS, OUTLINE_DEPTH_M, SECTORS, Circles, fit_discs, unknown_circles
 from tubepose.profile.plane import TopPlanes, fit_top_planes
 from tubepose.profile.rims import fit_rims
@@ -145,17 +145,7 @@ def label_points(standing: Standing, center_m: FloatArray, radius_m: FloatArray)
     reach = float(radius_m.max()) + NEAR_TOP_M + LABEL_CELL_M
     low = center_m.min(axis=0) - 2 * reach
     size = np.ceil((np.ptp(center_m, axis=0) + 4 * reach) / LABEL_CELL_M).astype(int) + 1
-    label = np.full(size, -1)
-    nearest = np.full(size, np.inf)
-    width = int(np.ceil(reach / LABEL_CELL_M))
-    for i, (center, radius) in enumerate(zip(center_m, radius_m, strict=True)):
-        at = np.rint((center - low) / LABEL_CELL_M).astype(int)
-        x, y = (low[k] + np.arange(at[k] - width, at[k] + width + 1) * LABEL_CELL_M - center[k] for k in (0, 1))
-        window = np.s_[at[0] - width : at[0] + width + 1, at[1] - width : at[1] + width + 1]
-        distance = np.hypot(x[:, None], y[None, :])
-        closer = (distance < nearest[window]) & (distance < radius + NEAR_TOP_M)
-        label[window][closer] = i
-        nearest[window][closer] = distance[closer]
+    label = nearest_tops(center_m, radius_m, NEAR_TOP_M, low, LABEL_CELL_M, size)
     # The picture's border belongs to no top.
     return np.asarray(cell_values(standing.points_m, low, LABEL_CELL_M, label))
 

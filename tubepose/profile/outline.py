@@ -13,12 +13,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tubepose.config import ProfileConfig
+from tubepose.profile.fit_kernels import circle_rounds
 from tubepose.profile.kernels import sector_counts
 from tubepose.transforms import FloatArray
 
 SECTORS = 24
 ANGLES = (np.arange(SECTORS) + 0.5) / SECTORS * 2 * np.pi - np.pi
 NORMALS: FloatArray = np.column_stack([np.cos(ANGLES), np.sin(ANGLES)])
+DESIGN: FloatArray = np.column_stack([NORMALS, np.ones(SECTORS), np.cos(2 * ANGLES), np.sin(2 * ANGLES)])
+"""Offset along x and y, widening, and the two parts of an ellipse, as they change the radius of a sector."""
 WIDTHS_M = ((2.0e-3, 2.0e-3), (1.2e-3, 1.2e-3), (0.8e-3, 0.9e-3))
 """How far inside and outside of the circle a sector's end is looked for, round by round."""
 DENSITY_BAND_M = 1.0e-3
@@ -156,28 +159,11 @@ def fit_circles(
     two more unknowns with a prior. Weights are Huber's. The noise `sigma_m` is one for all circles or one each, (T,);
     where the sectors scatter more, the circle is known so much worse: they are then seldom independent.
     """
-    sigma = np.broadcast_to(np.asarray(sigma_m), len(excess_m))[:, None]
-    design = np.column_stack([NORMALS, np.ones(SECTORS), np.cos(2 * ANGLES), np.sin(2 * ANGLES)])
-    prior = np.diag([0.0, 0.0, 1 / config.widening_m**2, 1 / config.widening_m**2, 1 / config.widening_m**2])
-    value = np.where(seen, excess_m, 0.0)
-    weight = seen / sigma**2
-    solution, residual = np.zeros((len(excess_m), 5)), np.zeros(excess_m.shape)
-    normal = np.tile(np.eye(5), (len(excess_m), 1, 1))
-    usable = seen.sum(axis=1) >= SECTORS // 4
-    for _ in range(6):
-        normal = np.einsum("ts,si,sj->tij", weight, design, design) + prior
-        normal[~usable] = np.eye(5)
-        right = (weight * value) @ design
-        solution = np.linalg.solve(normal, right[..., None])[..., 0]
-        residual = np.abs(value - solution @ design.T)
-        weight = seen / sigma**2 * np.minimum(1.0, 1.5 * sigma / np.maximum(residual, 1e-9))
-    scatter = ((seen * residual**2).sum(axis=1) / np.maximum(seen.sum(axis=1) - 3, 1))[:, None, None]
+    sigma = np.array(np.broadcast_to(np.asarray(sigma_m, float), len(excess_m)))
+    prior = np.diag([0.0, 0.0, *np.full(3, config.widening_m**-2)])
+    solution, normal, squares, counts = circle_rounds(excess_m, seen, sigma, DESIGN, prior, SECTORS // 4)
+    scatter = squares / np.maximum(counts - 3, 1)
     covariance = np.linalg.inv(normal)[:, :2, :2] + np.eye(2) * bias_m**2
-    covariance *= np.maximum(scatter / sigma[..., None] ** 2, 1.0)
-    usable &= np.trace(covariance, axis1=1, axis2=2) < MAX_STD_M**2
-    return Circles(
-        np.where(usable[:, None], solution[:, :2], np.nan),
-        covariance,
-        solution[:, 2],
-        (seen.sum(axis=1) / SECTORS),
-    )
+    covariance *= np.maximum(scatter / sigma**2, 1.0)[:, None, None]
+    usable = (counts >= SECTORS // 4) & (np.trace(covariance, axis1=1, axis2=2) < MAX_STD_M**2)
+    return Circles(np.where(usable[:, None], solution[:, :2], np.nan), covariance, solution[:, 2], counts / SECTORS)

@@ -11,11 +11,11 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
-from scipy.special import log_expit
 from scipy.stats import norm, qmc
 
 from tubepose.config import ProfileConfig
 from tubepose.labware import RackModel, SlotModel, TubeModel
+from tubepose.profile.fit_kernels import weighted_samples
 from tubepose.transforms import FloatArray
 
 SAMPLES = 256
@@ -105,17 +105,18 @@ def combine(
     covariance = np.linalg.inv(measured.matrix + prior)
     mean = np.einsum("tij,tj->ti", covariance, measured.vector)
     root = np.linalg.cholesky(covariance)
-    x = mean[:, None, :] + _normal_samples(samples) @ np.swapaxes(root, 1, 2)
-    log_prior = _log_allowed(x, play, slots, tubes, rack, config)
-    log_weight = log_prior + 0.5 * ((x / spread[:, None, :]) ** 2).sum(axis=2)
-    top = log_weight.max(axis=1, keepdims=True)
-    weight = np.exp(log_weight - top)
-    weight /= weight.sum(axis=1, keepdims=True)
-    posterior = (weight[:, None, :] @ x)[:, 0]
-    off = x - posterior[:, None, :]
-    spread_out = np.swapaxes(off * weight[..., None], 1, 2) @ off
+    # A straight body with a straight taper in a convex slot is inside if it is at both ends of what is inside: at the
+    # held point and at the rack's top. The slot's own tolerance at its floor is the floor's play.
+    ends = per_model(tubes, lambda tube: (tube.pivot_height_m, min(rack.depth_m, tube.height_m))).reshape(-1, 2)
+    radii = per_model(tubes, lambda tube: tube.body_radius_m(np.array([tube.pivot_height_m, rack.depth_m])))
+    openings = np.array([(*slot.size_mm, slot.corner_radius_mm, slot.shape == "round") for slot in slots], float)
+    openings = openings.reshape(-1, 4) * (0.5e-3, 0.5e-3, 1e-3, 1.0)
+    middle, scatter, allowed = weighted_samples(
+        mean, root, _normal_samples(samples), spread, play, openings, ends - ends[:, :1], radii.reshape(-1, 2),
+        config.slot_tolerance_m / 1.7,
+    )  # fmt: skip
     # Where hardly a sample is left its scatter says nothing: at least a tenth of what the measurements leave.
-    return Posterior(posterior, spread_out + 0.01 * covariance, np.exp(log_prior).mean(axis=1))
+    return Posterior(middle, scatter + 0.01 * covariance, allowed)
 
 
 @lru_cache(maxsize=4)
@@ -124,37 +125,3 @@ def _normal_samples(count: int) -> FloatArray:
     uniform = qmc.Sobol(4, scramble=True, rng=np.random.default_rng(0)).random(count // 2)
     half = norm.ppf(np.clip(uniform, 1e-6, 1 - 1e-6))
     return np.asarray(np.concatenate([half, -half]))
-
-
-def _log_allowed(
-    x: FloatArray,
-    play_m: FloatArray,
-    slots: Sequence[SlotModel],
-    tubes: Sequence[TubeModel],
-    rack: RackModel,
-    config: ProfileConfig,
-) -> FloatArray:
-    """Log of how far each sample (T, M, 4) is allowed: 0 inside, falling at the edges; shape (T, M).
-
-    A straight body with a straight taper in a convex slot is inside if it is at both ends of what is inside: at the
-    held point and at the rack's top.
-    """
-    soft = config.slot_tolerance_m / 1.7
-    total = log_expit((play_m[:, None] - np.hypot(x[..., 0], x[..., 1])) / soft)
-    groups: dict[tuple[object, ...], list[int]] = {}
-    for i, slot in enumerate(slots):
-        groups.setdefault((slot.shape, slot.size_mm, slot.corner_radius_mm), []).append(i)
-    held = per_model(tubes, lambda tube: tube.pivot_height_m)
-    top = per_model(tubes, lambda tube: min(rack.depth_m, tube.height_m))
-    radius = per_model(
-        tubes, lambda tube: tube.body_radius_m(np.array([tube.pivot_height_m, min(rack.depth_m, tube.height_m)]))
-    )
-    for members in groups.values():
-        slot = slots[members[0]]
-        at = np.asarray(members)
-        for end, z in enumerate((held, top)):
-            xy = x[at, :, :2] + x[at, :, 2:] * (z - held)[at, None, None]
-            room = -slot.signed_distance_m(xy + slot.center_m) - radius[at, end][:, None]
-            # The slot's own tolerance at its floor is the floor's play.
-            total[at] += log_expit(room / soft)
-    return np.asarray(total)

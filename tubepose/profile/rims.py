@@ -112,9 +112,10 @@ def _ring_scores(
     total = window.sum(axis=2)
     template = window * (ring - ((ring * window).sum(axis=2) / total)[..., None])
     norm2 = (template**2 / np.maximum(window, 1e-9)).sum(axis=2)
-    score = np.einsum("tsb,tmb->tsm", profile, template)
-    mean = np.einsum("tsb,tmb->tsm", profile, window) / total[:, None, :]
-    scatter = np.einsum("tsb,tmb->tsm", profile**2, window) - mean**2 * total[:, None, :]
+    window = window.swapaxes(1, 2)
+    score = profile @ template.swapaxes(1, 2)
+    mean = profile @ window / total[:, None, :]
+    scatter = profile**2 @ window - mean**2 * total[:, None, :]
     return moves, score, score / np.sqrt(np.maximum(norm2[:, None, :] * scatter, 1e-12))
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 
 import cv2
 import numpy as np
@@ -11,13 +12,15 @@ from numpy.typing import NDArray
 
 from tubepose.config import ProfileConfig
 from tubepose.labware import RackModel, SlotModel, TubeModel
-from tubepose.profile.kernels import level_pictures
+from tubepose.profile.kernels import best_places, level_pictures
 from tubepose.profile.standing import OUTSIDE_M, Standing
 from tubepose.transforms import FloatArray
 
 CELL_M = 1.0e-3
 PASSES = 3
 PICTURE_POINTS = 40_000
+CLOSE, NEAR = 0.03, 3.5
+"""Scores that are as good as the best one, and how many cells from it they are the same place."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -92,18 +95,17 @@ def find_tops(
     place = np.full((count, 3), -np.inf)
     second = np.full(count, -np.inf)
     for _ in range(PASSES):
-        open_slots = np.flatnonzero(best < 0)
-        if len(open_slots) == 0:
+        if (best >= 0).all():
             break
         found = np.full((len(tubes), count, 3), -np.inf)
         for k, tube in enumerate(tubes):
-            score = _top_score(*pictures[k], tube, config)
-            for i in open_slots[may[k, open_slots]]:
-                found[k, i] = _best_place(score, rack.all_slots[i], rack, tube, config)
+            windows = _windows(rack, tube, config.reach_m)
+            found[k] = best_places(_top_score(*pictures[k], tube, config), *windows, may[k] & (best < 0), CLOSE, NEAR)
+            found[k, :, 1:] = found[k, :, 1:] * CELL_M - rack.outline_m / 2 - OUTSIDE_M
         ranked = np.sort(found[:, :, 0], axis=0)
         kind = found[:, :, 0].argmax(axis=0)
         least = np.array([least_support(tube, config) for tube in tubes])[kind]
-        candidates = open_slots[ranked[-1, open_slots] > least[open_slots]]
+        candidates = np.flatnonzero((best < 0) & (ranked[-1] > least))
         where = found[kind, np.arange(count)]
         taken = np.flatnonzero(best >= 0)
         new = _without_overlaps(
@@ -179,24 +181,13 @@ def _erase(
             cv2.circle(picture, (int(at[1]), int(at[0])), int(np.ceil((radius + 0.7e-3) / CELL_M)), 0.0, -1)
 
 
-def _best_place(
-    score: NDArray[np.float32], slot: SlotModel, rack: RackModel, tube: TubeModel, config: ProfileConfig
-) -> tuple[float, float, float]:
-    """Best score and its place (x, y) in metres, within what a tube in the slot can reach with its top."""
-    half = rack.outline_m / 2 + OUTSIDE_M
-    reach = top_reach_m(slot, tube, rack) + config.reach_m
-    low = np.maximum(np.floor((slot.center_m - reach + half) / CELL_M).astype(int), 0)
-    high = np.ceil((slot.center_m + reach + half) / CELL_M).astype(int) + 1
-    window = score[low[0] : high[0], low[1] : high[1]]
-    peak = float(window.max(initial=-np.inf))
-    if not np.isfinite(peak):
-        return -np.inf, np.nan, np.nan
-    # Several cells are as good: the middle of those close to the best.
-    places = np.argwhere(window >= peak - 0.03)
-    first = places[np.argmax(window[places[:, 0], places[:, 1]])]
-    places = places[np.hypot(*(places - first).T) < 3.5]
-    x, y = (places.mean(axis=0) + low) * CELL_M - half
-    return peak, float(x), float(y)
+@lru_cache(maxsize=64)
+def _windows(rack: RackModel, tube: TubeModel, reach_m: float) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """First cells (S, 2) and those after the last (S, 2) of where the top of a tube can be, slot by slot."""
+    reach = np.array([top_reach_m(slot, tube, rack) for slot in rack.all_slots])[:, None] + reach_m
+    corner = rack.slot_centers_m + rack.outline_m / 2 + OUTSIDE_M
+    low, high = np.floor((corner - reach) / CELL_M), np.ceil((corner + reach) / CELL_M) + 1
+    return low.astype(np.intp), high.astype(np.intp)
 
 
 def top_reach_m(slot: SlotModel, tube: TubeModel, rack: RackModel) -> float:
@@ -214,12 +205,14 @@ def _without_overlaps(
     tubes: Sequence[TubeModel],
 ) -> NDArray[np.intp]:
     """Slots in order, without those whose top overlaps a better one or one that was found before: discs cannot."""
-    radius = np.array([top_radius_m(tube) for tube in tubes])
-    kept = [int(slot) for slot in taken]
+    radius = np.array([top_radius_m(tube) for tube in tubes])[kind]
+    apart = np.hypot(*(place[:, None, 1:] - place[None, :, 1:]).T)
+    clear = apart > 0.75 * (radius[:, None] + radius)
+    kept = np.zeros(len(place), bool)
+    kept[taken] = True
     new: list[int] = []
     for slot in slots[np.argsort(-place[slots, 0], kind="stable")]:
-        apart = np.hypot(*(place[kept, 1:] - place[slot, 1:]).T)
-        if np.all(apart > 0.75 * (radius[kind[slot]] + radius[kind[kept]])):
-            kept.append(int(slot))
+        if clear[slot, kept].all():
+            kept[slot] = True
             new.append(int(slot))
     return np.array(sorted(new), np.intp)

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from tubepose.config import ProfileConfig
 from tubepose.labware import RackModel, TubeModel
+from tubepose.profile.fit_kernels import wall_rows, wall_sums
 from tubepose.profile.posterior import Evidence, no_evidence, per_model
 from tubepose.profile.standing import Standing
 from tubepose.transforms import FloatArray
@@ -52,59 +53,27 @@ def wall_evidence(
     count = len(tubes)
     if count == 0:
         return no_evidence(0)
-    residual, normal, above, of = _wall_points(standing, label, pose, centers_m, tubes, rack, config)
+    held = per_model(tubes, lambda tube: tube.pivot_height_m)
+    skirt = per_model(tubes, _skirt_m) - SKIRT_GAP_M
+    body = per_model(tubes, lambda tube: [tube.body.bottom_diameter_mm, tube.body.top_diameter_mm]) * 0.5e-3
+    ends = per_model(tubes, lambda tube: [tube.body.bottom_height_mm, tube.body.height_mm]) * 1e-3
     sigma = config.wall_noise_m
+    # The cut through a leaning tube is an ellipse: across the lean the radius, along it longer by 1 / cos.
+    residual, normal, above, of = wall_rows(
+        standing.points_m, label, standing.camera_m, pose, centers_m, rack.floor_m, held, skirt, body, ends,
+        2 * PEAK * sigma,
+    )  # fmt: skip
     near = np.abs(residual) < PEAK * sigma
     n_near, n_beside = (np.bincount(of[chosen], minlength=count) for chosen in (near, ~near))
     peak = np.clip((n_near - n_beside) / np.maximum(n_near, 1), 0.0, 1.0)
-    weight = np.where(near, (1 - (residual / (PEAK * sigma)) ** 2) ** 2, 0.0) * (peak**2)[of]
-    weight *= (n_near >= config.min_wall_points)[of] / (sigma**2 * config.wall_redundancy)
-    rows = np.column_stack([-normal, -normal * above[:, None], np.ones(len(of))])
+    weight = peak**2 * (n_near >= config.min_wall_points) / (sigma**2 * config.wall_redundancy)
     # The residual is wanted to vanish: rows x = target; the radius, the last unknown, is marginalised.
-    target = np.einsum("ij,ij->i", rows[:, :4], pose[of]) - residual
-    matrix, vector = np.zeros((count, 5, 5)), np.zeros((count, 5))
-    for i in range(5):
-        scaled = weight * rows[:, i]
-        vector[:, i] = np.bincount(of, scaled * target, minlength=count)
-        for j in range(i, 5):
-            matrix[:, i, j] = matrix[:, j, i] = np.bincount(of, scaled * rows[:, j], minlength=count)
+    matrix, vector = wall_sums(residual, normal, above, of, pose, weight, PEAK * sigma)
     matrix[:, 4, 4] += 1 / config.wall_radius_m**2
     gain = matrix[:, :4, 4] / matrix[:, 4, 4][:, None]
     return Evidence(
         matrix[:, :4, :4] - gain[:, :, None] * matrix[:, None, 4, :4], vector[:, :4] - gain * vector[:, 4][:, None]
     )
-
-
-def _wall_points(
-    standing: Standing,
-    label: NDArray[np.intp],
-    pose: FloatArray,
-    centers_m: FloatArray,
-    tubes: Sequence[TubeModel],
-    rack: RackModel,
-    config: ProfileConfig,
-) -> tuple[FloatArray, FloatArray, FloatArray, NDArray[np.intp]]:
-    """Residual, direction from the axis (N, 2), height above the held point, and tube of the points near a wall."""
-    held = per_model(tubes, lambda tube: tube.pivot_height_m)
-    skirt = per_model(tubes, _skirt_m) - SKIRT_GAP_M
-    body = per_model(tubes, lambda tube: [tube.body.bottom_diameter_mm, tube.body.top_diameter_mm]) * 0.5e-3
-    ends = per_model(tubes, lambda tube: [tube.body.bottom_height_mm, tube.body.height_mm]) * 1e-3
-    rows = np.flatnonzero(label >= 0)
-    of = label[rows]
-    low = standing.points_m[rows, 2] - rack.floor_m < skirt[of]
-    rows, of = rows[low], of[low]
-    p = standing.points_m[rows]
-    above = p[:, 2] - rack.floor_m - held[of]
-    off = p[:, :2] - centers_m[of] - pose[of, :2] - above[:, None] * pose[of, 2:]
-    # The cut through a leaning tube is an ellipse: across the lean the radius, along it longer by 1 / cos.
-    rho = np.hypot(*off.T)
-    s = above + held[of]
-    share = np.clip((s - ends[of, 0]) / (ends[of, 1] - ends[of, 0]), 0, 1)
-    residual = rho - (body[of, 0] + share * (body[of, 1] - body[of, 0]))
-    towards = standing.camera_m[:2] - p[:, :2]
-    kept = (np.abs(residual) < 2 * PEAK * config.wall_noise_m) & (np.einsum("ij,ij->i", off, towards) > 0)
-    normal = off[kept] / rho[kept][:, None]
-    return residual[kept], normal, above[kept], of[kept]
 
 
 def _skirt_m(tube: TubeModel) -> float:

@@ -1,0 +1,199 @@
+"""The loops over sectors, samples and points of walls, compiled; see `kernels`, whose promises these keep."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit
+
+ROUNDS = 6
+"""Of the reweighted least squares of circles."""
+HUBER = 1.5
+"""Residuals larger than this many standard deviations count as if they were that large."""
+LARGEST = 200.0
+"""Exponents are cut here: the product of three such powers is still a number."""
+
+compiled = njit(cache=True, error_model="numpy")
+
+
+@compiled
+def solved(matrix, right):
+    """Solution (n,) of a small symmetric positive definite system, by Gaussian elimination."""
+    a, b = matrix.copy(), right.copy()
+    n = len(b)
+    for i in range(n):
+        for j in range(i + 1, n):
+            factor = a[j, i] / a[i, i]
+            for k in range(i, n):
+                a[j, k] -= factor * a[i, k]
+            b[j] -= factor * b[i]
+    for i in range(n - 1, -1, -1):
+        for k in range(i + 1, n):
+            b[i] -= a[i, k] * b[k]
+        b[i] /= a[i, i]
+    return b
+
+
+@compiled
+def circle_rounds(excess_m, seen, sigma_m, design, prior, least_seen):
+    """Huber's regression of the excess radii (T, S) that are seen on a design (S, M), with a prior's information (M, M).
+
+    Returns the solutions (T, M), the last normal equations (T, M, M), the sums of squared residuals (T,) and how many
+    sectors are seen (T,); where fewer than the least, nothing is solved.
+    """
+    tubes, sectors = excess_m.shape
+    unknowns = design.shape[1]
+    solution, squares = np.zeros((tubes, unknowns)), np.zeros(tubes)
+    normal, counts = np.zeros((tubes, unknowns, unknowns)), np.zeros(tubes, np.intp)
+    weight, right = np.empty(sectors), np.empty(unknowns)
+    for t in range(tubes):
+        for s in range(sectors):
+            counts[t] += seen[t, s]
+            weight[s] = 1.0 / sigma_m[t] ** 2 if seen[t, s] else 0.0
+        if counts[t] < least_seen:
+            normal[t] = np.eye(unknowns)
+            continue
+        for _ in range(ROUNDS):
+            normal[t] = prior
+            right[:] = 0.0
+            for s in range(sectors):
+                if seen[t, s]:
+                    for i in range(unknowns):
+                        scaled = weight[s] * design[s, i]
+                        right[i] += scaled * excess_m[t, s]
+                        for j in range(unknowns):
+                            normal[t, i, j] += scaled * design[s, j]
+            solution[t] = solved(normal[t], right)
+            squares[t] = 0.0
+            for s in range(sectors):
+                if seen[t, s]:
+                    residual = excess_m[t, s]
+                    for i in range(unknowns):
+                        residual -= design[s, i] * solution[t, i]
+                    size = abs(residual)
+                    squares[t] += residual * residual
+                    weight[s] = min(1.0, HUBER * sigma_m[t] / max(size, 1e-9)) / sigma_m[t] ** 2
+    return solution, normal, squares, counts
+
+
+@compiled
+def doubt(x):
+    """1 + exp(-x): one over the chance of something that is certain far above 0, and impossible far below."""
+    return 1.0 + math.exp(min(-x, LARGEST))
+
+
+@compiled
+def room_m(x, y, opening):
+    """Distance of a place, from a slot's centre, to its opening's edge, positive inside.
+
+    An opening is half its size along x and y, its corners' radius, and whether it is round.
+    """
+    if opening[3] > 0.0:
+        return opening[0] - math.sqrt(x * x + y * y)
+    corner_m = opening[2]
+    right, ahead = abs(x) - (opening[0] - corner_m), abs(y) - (opening[1] - corner_m)
+    outside = math.sqrt(max(right, 0.0) ** 2 + max(ahead, 0.0) ** 2)
+    return corner_m - outside - min(max(right, ahead), 0.0)
+
+
+@compiled
+def weighted_samples(mean, root, normal, spread, play_m, openings_m, levers_m, radii_m, soft_m):
+    """Mean (T, 4), covariance (T, 4, 4) and mean chance (T,) of Gaussian samples that slots allow, T tubes.
+
+    Samples are ``mean + root z`` for standard normal z (M, 4), weighted by what is allowed over a Gaussian about 0 of
+    standard deviations `spread` (T, 4): the foot within the play, the axis inside the slot's opening (T, 4), as
+    `room_m` has it, at two heights `levers_m` (T, 2) above the foot, where the body has `radii_m` (T, 2). Edges are as
+    soft as `soft_m`.
+    """
+    tubes, samples = len(mean), len(normal)
+    middle, covariance, allowed = np.zeros((tubes, 4)), np.zeros((tubes, 4, 4)), np.zeros(tubes)
+    x, weight = np.empty((samples, 4)), np.empty(samples)
+    for t in range(tubes):
+        most = -np.inf
+        for m in range(samples):
+            gaussian = 0.0
+            for i in range(4):
+                value = mean[t, i]
+                for j in range(i + 1):
+                    value += root[t, i, j] * normal[m, j]
+                x[m, i] = value
+                gaussian += (value / spread[t, i]) ** 2
+            doubts = doubt((play_m[t] - math.sqrt(x[m, 0] ** 2 + x[m, 1] ** 2)) / soft_m)
+            for k in range(2):
+                right, ahead = x[m, 0] + levers_m[t, k] * x[m, 2], x[m, 1] + levers_m[t, k] * x[m, 3]
+                doubts *= doubt((room_m(right, ahead, openings_m[t]) - radii_m[t, k]) / soft_m)
+            allowed[t] += 1.0 / (doubts * samples)
+            weight[m] = 0.5 * gaussian - math.log(doubts)
+            most = max(most, weight[m])
+        total = 0.0
+        for m in range(samples):
+            weight[m] = math.exp(weight[m] - most)
+            total += weight[m]
+        for m in range(samples):
+            weight[m] /= total
+            for i in range(4):
+                middle[t, i] += weight[m] * x[m, i]
+        for m in range(samples):
+            for i in range(4):
+                scaled = weight[m] * (x[m, i] - middle[t, i])
+                for j in range(i + 1):
+                    covariance[t, i, j] += scaled * (x[m, j] - middle[t, j])
+        for i in range(4):
+            for j in range(i):
+                covariance[t, j, i] = covariance[t, i, j]
+    return middle, covariance, allowed
+
+
+@compiled
+def wall_rows(points_m, label, camera_m, pose, centers_m, floor_m, held_m, skirt_m, body_m, ends_m, reach_m):
+    """Residual (N,), direction from the axis (N, 2), height above the foot (N,) and tube (N,) of points near a wall.
+
+    Of points (K, 3) below the skirt of their tube, on the camera's side of it, and within a reach of its radius. Bodies
+    have two radii `body_m` (T, 2) at two heights `ends_m` (T, 2) above the bottom, and are straight between them.
+    """
+    residual, normal = np.empty(len(points_m)), np.empty((len(points_m), 2))
+    above, of = np.empty(len(points_m)), np.empty(len(points_m), np.intp)
+    count = 0
+    for k in range(len(points_m)):
+        t = label[k]
+        if t < 0 or not points_m[k, 2] - floor_m < skirt_m[t]:
+            continue
+        up = points_m[k, 2] - floor_m - held_m[t]
+        x = points_m[k, 0] - centers_m[t, 0] - pose[t, 0] - up * pose[t, 2]
+        y = points_m[k, 1] - centers_m[t, 1] - pose[t, 1] - up * pose[t, 3]
+        rho = math.sqrt(x * x + y * y)
+        share = (up + held_m[t] - ends_m[t, 0]) / (ends_m[t, 1] - ends_m[t, 0])
+        off = rho - (body_m[t, 0] + min(max(share, 0.0), 1.0) * (body_m[t, 1] - body_m[t, 0]))
+        faces = x * (camera_m[0] - points_m[k, 0]) + y * (camera_m[1] - points_m[k, 1]) > 0.0
+        if abs(off) < reach_m and faces:
+            residual[count], above[count], of[count] = off, up, t
+            normal[count, 0], normal[count, 1] = x / rho, y / rho
+            count += 1
+    return residual[:count], normal[:count], above[:count], of[:count]
+
+
+@compiled
+def wall_sums(residual_m, normal, above_m, of, pose, weight, near_m):
+    """Normal equations (T, 5, 5) and right sides (T, 5) of rows of `wall_rows` about (u, v, a, b, radius).
+
+    A row's weight is its tube's (T,), and falls to 0 at a distance `near_m` from the wall.
+    """
+    matrix, vector = np.zeros((len(weight), 5, 5)), np.zeros((len(weight), 5))
+    row = np.ones(5)
+    for k in range(len(of)):
+        t = of[k]
+        u = residual_m[k] / near_m
+        if abs(u) >= 1.0:
+            continue
+        w = weight[t] * (1.0 - u * u) ** 2
+        row[0], row[1] = -normal[k, 0], -normal[k, 1]
+        row[2], row[3] = row[0] * above_m[k], row[1] * above_m[k]
+        target = -residual_m[k]
+        for i in range(4):
+            target += row[i] * pose[t, i]
+        for i in range(5):
+            vector[t, i] += w * row[i] * target
+            for j in range(5):
+                matrix[t, i, j] += w * row[i] * row[j]
+    return matrix, vector
