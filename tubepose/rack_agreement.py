@@ -18,8 +18,9 @@ from tubepose import rack_kernels as kernels
 from tubepose import rack_view_kernels as view_kernels
 from tubepose.config import RackConfig
 from tubepose.labware import RackModel
+from tubepose.rack_evidence import evidence_of
 from tubepose.rack_field import GRID_M, PICTURE_M, picture, top_field
-from tubepose.rack_fit import EDGE_SHIFT_M, LEAST_POINTS, WRONG_SHARE, Fit, Labels, camera_place, label, top_frame
+from tubepose.rack_fit import LEAST_POINTS, Fit, camera_place, label, top_frame
 from tubepose.transforms import FloatArray
 
 # Half thickness of the layer that is judged: the standard deviation of heights, but at least that of a good sensor, and
@@ -31,13 +32,6 @@ RIM_M = 0.7e-3
 SCATTER_M = 2.5e-3
 # A top that goes on across its outline is another; a rack that stands beside it may be this near.
 BORDER_M = 3.5e-3
-# Blur of an edge in what counts as evidence: it must forgive a pixel.
-EVIDENCE_BLUR_M = 0.4e-3
-# Distances that its likelihood is tabled over: beyond them it is what wrong pixels leave.
-CHANCE_STEP_M = 5e-6
-CHANCE_STEPS = 1600
-# Points that evidence is counted on where it is counted several times.
-EVIDENCE_POINTS = 3000
 # Points nearer than this share their label's error: they count as one.
 INDEPENDENT_M = 1.5e-3
 # Lines of sight this far inside a rib pass through it.
@@ -102,7 +96,7 @@ def measure_agreement(points_m: FloatArray, fit: Fit, rack: RackModel, config: R
     ribs = _on_ribs(points_m, fit, rack)
     spacing_m = _spacing(ribs[:, :2])
     scatter_m = float(1.4826 * np.median(np.abs(ribs[:, 2])))
-    evidence, beside, step_m = _evidence(seen, rack)
+    evidence, beside, step_m = evidence_of(seen, rack)
     alike = min(1.0, (spacing_m / INDEPENDENT_M) ** 2)
     return Agreement(
         rmse_m=float(np.hypot(scatter_m, np.sqrt(np.mean(np.maximum(distance[near], 0) ** 2)))),
@@ -135,42 +129,6 @@ def _unseen(points_m: FloatArray, fit: Fit, rack: RackModel) -> float:
     return float(1 - hit.mean())
 
 
-def _evidence(seen: Labels, rack: RackModel) -> tuple[float, float, tuple[float, float]]:
-    """Evidence of the pose, and the most of any pose a slot farther with its step, in nats of all points."""
-    solid, free = seen.solid_m[:, :2], seen.free_m
-    steps = len(solid) // EVIDENCE_POINTS + 1, len(free) // EVIDENCE_POINTS + 1
-    solid, free = solid[:: steps[0]].copy(), free[:: steps[1]].copy()
-
-    def at(shift_m: FloatArray) -> float:
-        return sum(
-            step
-            * float(
-                view_kernels.table_sum(places, shift_m, *top_field(rack).grid, _log_chances(rack, sign), CHANCE_STEP_M)
-            )
-            for places, sign, step in ((solid, 1, steps[0]), (free, -1, steps[1]))
-        )
-
-    beside = [(at(shift), (float(shift[0]), float(shift[1]))) for shift in slot_steps_m(rack)]
-    return at(np.zeros(2)), *max(beside, default=(-np.inf, (0.0, 0.0)))
-
-
-def _chance(inside_m: FloatArray) -> FloatArray:
-    return WRONG_SHARE + (1 - 2 * WRONG_SHARE) / (1 + np.exp(-inside_m / EVIDENCE_BLUR_M))
-
-
-@lru_cache(maxsize=64)
-def _mean_chance(rack: RackModel, sign: int) -> float:
-    """Mean over the field: what a point has that could as well lie anywhere."""
-    return float(_chance(sign * (EDGE_SHIFT_M - top_field(rack).table[::7, 0].astype(float))).mean())
-
-
-@lru_cache(maxsize=64)
-def _log_chances(rack: RackModel, sign: int) -> FloatArray:
-    """How much likelier a point is here than anywhere, nats, over its distance from the solid part."""
-    distance = CHANCE_STEP_M * np.arange(-CHANCE_STEPS, CHANCE_STEPS + 1, dtype=float)
-    return np.log(_chance(sign * (EDGE_SHIFT_M - distance)) / _mean_chance(rack, sign))
-
-
 @lru_cache(maxsize=32)
 def _rim_share(rack: RackModel) -> float:
     """Share of the solid part's area that is near an edge."""
@@ -183,17 +141,6 @@ def _near_rims(xy_m: FloatArray, distance_m: NDArray[np.floating], rack: RackMod
     """Share of the places (N, 2) on the solid part, away from the outline, that are near the edge of an opening."""
     inner = np.all(np.abs(xy_m) < rack.outline_m / 2 - 2 * RIM_M, axis=1) & (distance_m < 0)
     return float(np.mean(distance_m[inner] > -RIM_M)) if inner.any() else 0.0
-
-
-@lru_cache(maxsize=32)
-def slot_steps_m(rack: RackModel) -> tuple[FloatArray, ...]:
-    """Shifts that lay many slots onto others: one slot along rows, columns and diagonals; shape (2,) each, metres."""
-    centers = rack.slot_centers_m
-    apart = np.rint((centers[:, None] - centers[None]).reshape(-1, 2) * 1e4).astype(int)
-    steps, counts = np.unique(apart, axis=0, return_counts=True)
-    kept = (counts >= 0.4 * len(centers)) & (np.abs(steps).max(axis=1) > 0)
-    steps = steps[kept]
-    return tuple(steps[np.argsort(np.hypot(*steps.T), kind="stable")][:8] * 1e-4)
 
 
 def _coverage(solid_m: FloatArray, rack: RackModel) -> float:

@@ -16,14 +16,17 @@ from tubepose.labware import RackModel
 from tubepose.preprocessing import point_spacing_m, thin
 from tubepose.rack_acceptance import outline_words, too_coarse
 from tubepose.rack_agreement import Agreement, contradiction, measure_agreement, outline_fits
+from tubepose.rack_evidence import likelier_step_m
 from tubepose.rack_field import top_field
-from tubepose.rack_fit import Fit, camera_place, refine, top_frame
+from tubepose.rack_fit import HOPELESS_SHARE, Fit, RoughFit, camera_place, rack_frame, refine, roughly, top_frame
 from tubepose.rack_pose import MIN_POINTS, RackPose, RackStatus, choose_turn
 from tubepose.rack_search import Band, levels, search
 from tubepose.transforms import HALF_TURN, FloatArray, make_transform
 
 # A rack full of caps shows its lattice better than its ends: so many slots may the search be off.
 SLOT_STEPS = 6
+# Steps that lead back to a place this near are of no use.
+NEAR_STEP_M = 4e-3
 # Places whose coarse picture agrees less than this, compared with one that was accepted, are no rivals of it.
 RIVAL_WORTH = 0.4
 
@@ -169,22 +172,43 @@ def seen_near(points_m: FloatArray, T_camera_rack: FloatArray, rack: RackModel) 
 
 def register_at(points_m: FloatArray, T_camera_rack: FloatArray, rack: RackModel, config: RackConfig) -> Registration:
     """Refine a coarse pose and judge it; where one a slot farther has more evidence, go there first."""
-    near_m = seen_near(points_m, T_camera_rack, rack)
-    fit = refine(near_m, T_camera_rack, rack)
+    near_m, rough = _on_lattice(points_m, T_camera_rack, rack)
+    fit = refine(rough, rack)
     agreement = measure_agreement(near_m, fit, rack, config)
     for _ in range(SLOT_STEPS):
         # No step smooths what is rough, nor empties openings.
-        rough = agreement.in_slot > 2 * config.max_stray_share or agreement.rmse_m > config.max_inlier_rmse_m
-        if agreement.slot_margin >= 0 or rough:
+        stray = agreement.in_slot > 2 * config.max_stray_share or agreement.rmse_m > config.max_inlier_rmse_m
+        if agreement.slot_margin >= 0 or stray:
             break
         T_step = make_transform(np.eye(3), np.array([*agreement.step_m, 0.0]))
-        near_m = seen_near(points_m, fit.T_camera_rack @ T_step, rack)
-        farther = refine(near_m, fit.T_camera_rack @ T_step, rack)
+        near_m, rough = _look_at(points_m, fit.T_camera_rack @ T_step, rack)
+        farther = refine(rough, rack)
         there = measure_agreement(near_m, farther, rack, config)
         if there.evidence <= agreement.evidence:
             break
         fit, agreement = farther, there
     return Registration(fit, agreement, contradiction(agreement, fit, rack, config))
+
+
+def _on_lattice(points_m: FloatArray, T_camera_rack: FloatArray, rack: RackModel) -> tuple[FloatArray, RoughFit]:
+    """Points near a coarse pose, and a rough fit there or as many slots farther as a first look at it says."""
+    near_m, rough = _look_at(points_m, T_camera_rack, rack)
+    been: list[FloatArray] = []
+    for _ in range(SLOT_STEPS):
+        step_m = likelier_step_m(rough, rack)
+        if step_m is None or rough.stray > HOPELESS_SHARE:
+            break
+        been.append(rough.T_camera_top[:3, 3])
+        T_there = rack_frame(rough, rack) @ make_transform(np.eye(3), np.array([*step_m, 0.0]))
+        if any(np.linalg.norm(T_there @ [0, 0, rack.height_m, 1] - [*place, 1]) < NEAR_STEP_M for place in been):
+            break
+        near_m, rough = _look_at(points_m, T_there, rack)
+    return near_m, rough
+
+
+def _look_at(points_m: FloatArray, T_camera_rack: FloatArray, rack: RackModel) -> tuple[FloatArray, RoughFit]:
+    near_m = seen_near(points_m, T_camera_rack, rack)
+    return near_m, roughly(near_m, T_camera_rack, rack)
 
 
 def _pose(

@@ -86,8 +86,21 @@ class Fit:
 
 
 @dataclass(slots=True, eq=False)
-class _State:
+class RoughFit:
+    """A pose after the first rounds, and what it goes on with; the later ones change it in place.
+
+    Attributes:
+        T_camera_top: Frame of the top, shape (4, 4), metres.
+        kept_m: Points near the top, camera frame, shape (N, 3), metres.
+        rough_m: Some of them, which the first rounds saw.
+        scatter_m: Standard deviation of heights about the plane, metres.
+        covariance: Of the last round, shape (6, 6).
+        stray: Share of the points at the top's height that lie far from its solid part.
+    """
+
     T_camera_top: FloatArray
+    kept_m: FloatArray
+    rough_m: FloatArray
     scatter_m: float
     covariance: FloatArray
     stray: float = 1.0
@@ -98,21 +111,39 @@ def top_frame(T_camera_rack: FloatArray, rack: RackModel) -> FloatArray:
     return T_camera_rack @ make_transform(np.eye(3), np.array([0.0, 0.0, rack.height_m]))
 
 
-def refine(points_m: FloatArray, T_camera_rack: FloatArray, rack: RackModel) -> Fit:
-    """Refine a coarse pose (2 mm and 1.5 degrees off at most) with points (N, 3), camera frame, metres."""
-    field = top_field(rack)
-    state = _State(top_frame(T_camera_rack, rack), WIDEST_M, UNKNOWN * np.eye(6))
-    points_m = np.ascontiguousarray(points_m, float)
-    T, reach_m = state.T_camera_top, rack.outline_m / 2 + 5e-3
-    kept = kernels.near_top(points_m, T[:3, :3], T[:3, 3], reach_m, 5e-3)
-    rough, fine = (kept[:: len(kept) // count + 1].copy() for count in (ROUGH_POINTS, FINE_POINTS))
-    for number, (blur_m, widths_m) in enumerate(ROUNDS_M):
-        _step(rough if number < ROUGH_ROUNDS else fine, state, field, blur_m, widths_m, number == len(ROUNDS_M) - 1)
-        if number == ROUGH_ROUNDS - 1 and state.stray > HOPELESS_SHARE:
-            break
+def roughly(points_m: FloatArray, T_camera_rack: FloatArray, rack: RackModel) -> RoughFit:
+    """The first rounds from a coarse pose (2 mm and 1.5 degrees off at most), with points (N, 3), camera frame."""
+    T, reach_m = top_frame(T_camera_rack, rack), rack.outline_m / 2 + 5e-3
+    kept = kernels.near_top(np.ascontiguousarray(points_m, float), T[:3, :3], T[:3, 3], reach_m, 5e-3)
+    state = RoughFit(T, kept, _thinned(kept, ROUGH_POINTS), WIDEST_M, UNKNOWN * np.eye(6))
+    for blur_m, widths_m in ROUNDS_M[:ROUGH_ROUNDS]:
+        _step(state.rough_m, state, top_field(rack), blur_m, widths_m, False)
+    return state
+
+
+def refine(state: RoughFit, rack: RackModel) -> Fit:
+    """The other rounds; none where so much lies beside the solid part that they are of no use."""
+    field, fine = top_field(rack), _thinned(state.kept_m, FINE_POINTS)
+    for number, (blur_m, widths_m) in enumerate(ROUNDS_M[ROUGH_ROUNDS:], ROUGH_ROUNDS):
+        if state.stray <= HOPELESS_SHARE:
+            _step(fine, state, field, blur_m, widths_m, number == len(ROUNDS_M) - 1)
     covariance = INFLATE @ state.covariance @ INFLATE + np.diag(FLOOR**2)
-    T = state.T_camera_top @ make_transform(np.eye(3), np.array([0.0, 0.0, -rack.height_m]))
-    return Fit(T, covariance, state.scatter_m, *_stretch(rough, state, field))
+    return Fit(rack_frame(state, rack), covariance, state.scatter_m, *_stretch(state, field))
+
+
+def rack_frame(state: RoughFit, rack: RackModel) -> FloatArray:
+    """T_camera_rack of a fit, shape (4, 4), metres."""
+    return np.asarray(state.T_camera_top @ make_transform(np.eye(3), np.array([0.0, 0.0, -rack.height_m])))
+
+
+def at_the_top(state: RoughFit) -> FloatArray:
+    """Places of the rough fit's points that are at the height of its top, frame of the top, shape (N, 2), metres."""
+    local = to_frame(state.rough_m, state.T_camera_top)
+    return local[np.abs(local[:, 2]) < max(EDGE_WINDOW_M, min(3 * state.scatter_m, WIDEST_M)), :2]
+
+
+def _thinned(points_m: FloatArray, count: int) -> FloatArray:
+    return points_m[:: len(points_m) // count + 1].copy()
 
 
 def to_frame(points_m: FloatArray, T_camera_frame: FloatArray) -> FloatArray:
@@ -121,7 +152,7 @@ def to_frame(points_m: FloatArray, T_camera_frame: FloatArray) -> FloatArray:
 
 
 def _step(
-    points_m: FloatArray, state: _State, field: TopField, blur_m: float, widths_m: FloatArray, last: bool
+    points_m: FloatArray, state: RoughFit, field: TopField, blur_m: float, widths_m: FloatArray, last: bool
 ) -> None:
     """One round of plane and edges, in place; the last one tells their covariance."""
     T = state.T_camera_top
@@ -141,11 +172,9 @@ def _step(
     state.T_camera_top = state.T_camera_top @ T_step
 
 
-def _stretch(points_m: FloatArray, state: _State, field: TopField) -> tuple[FloatArray, FloatArray]:
+def _stretch(state: RoughFit, field: TopField) -> tuple[FloatArray, FloatArray]:
     """Stretch along x and y with which the template agrees best, and its standard deviations."""
-    T = state.T_camera_top
-    local = to_frame(points_m, T)
-    xy = local[np.abs(local[:, 2]) < max(EDGE_WINDOW_M, min(3 * state.scatter_m, WIDEST_M)), :2]
+    xy = at_the_top(state)
     places = np.zeros((len(xy), 3))
     moved = np.zeros(5)
     covariance = np.eye(5)

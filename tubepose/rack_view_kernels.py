@@ -64,22 +64,24 @@ def seen_through(points_m, rotation, origin_m, camera_m, reach_m):
 
 
 @compiled
-def table_sum(xy_m, shift_m, low_m, cell_m, shape, table, values, step_m):
-    """Sum over places (N, 2 or more), less a shift, on a field's grid, of values that are tabled over the distance.
+def table_sums(xy_m, shifts_m, low_m, cell_m, shape, table, values, step_m):
+    """Sums (S,) over places (N, 2), less each shift (S, 2), on a field's grid, of values tabled over the distance.
 
     Values lie `step_m` apart, the middle one at distance 0; between them it is linear, beyond them constant.
     """
-    total, middle, last = 0.0, len(values) // 2, len(values) - 1.001
-    for k in range(len(xy_m)):
-        x, y = (xy_m[k, 0] - shift_m[0] - low_m[0]) / cell_m, (xy_m[k, 1] - shift_m[1] - low_m[1]) / cell_m
-        if -0.5 <= x < shape[0] - 0.5 and -0.5 <= y < shape[1] - 0.5:
-            i, j = math.floor(x + 0.5), math.floor(y + 0.5)
-            cell = table[i * shape[1] + j]
-            distance = cell[0] + cell_m * ((x - i) * cell[1] + (y - j) * cell[2])
-            place = min(max(distance / step_m + middle, 0.0), last)
-            m = int(place)
-            total += values[m] + (place - m) * (values[m + 1] - values[m])
-    return total
+    totals, middle, last = np.zeros(len(shifts_m)), len(values) // 2, len(values) - 1.001
+    for s in range(len(shifts_m)):
+        low_x, low_y = low_m[0] + shifts_m[s, 0], low_m[1] + shifts_m[s, 1]
+        for k in range(len(xy_m)):
+            x, y = (xy_m[k, 0] - low_x) / cell_m, (xy_m[k, 1] - low_y) / cell_m
+            if -0.5 <= x < shape[0] - 0.5 and -0.5 <= y < shape[1] - 0.5:
+                i, j = math.floor(x + 0.5), math.floor(y + 0.5)
+                cell = table[i * shape[1] + j]
+                distance = cell[0] + cell_m * ((x - i) * cell[1] + (y - j) * cell[2])
+                place = min(max(distance / step_m + middle, 0.0), last)
+                m = int(place)
+                totals[s] += values[m] + (place - m) * (values[m + 1] - values[m])
+    return totals
 
 
 @compiled

@@ -37,7 +37,7 @@ def solved(matrix, right):
 
 @compiled
 def circle_rounds(excess_m, seen, sigma_m, design, prior, least_seen):
-    """Huber's regression of the excess radii (T, S) that are seen on a design (S, M), with a prior's information (M, M).
+    """Huber regression of the excess radii (T, S) that are seen on a design (S, M), with a prior of information (M, M).
 
     Returns the solutions (T, M), the last normal equations (T, M, M), the sums of squared residuals (T,) and how many
     sectors are seen (T,); where fewer than the least, nothing is solved.
