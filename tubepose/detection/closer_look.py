@@ -45,7 +45,7 @@ def look_twice(image: NDArray[np.uint8], look: Look, looks: Looks, is_rack: NDAr
 
     Args:
         image: RGB, shape (H, W, 3).
-        look: Runs the network.
+        look: Runs the network; boxes from `LEAST_TUBE_SCORE` on.
         looks: Sizes of its input.
         is_rack: For every class whether it is a rack, shape (C,).
     """
@@ -59,8 +59,8 @@ def look_twice(image: NDArray[np.uint8], look: Look, looks: Looks, is_rack: NDAr
     inner = [_widened(box, 0.5) for box in chosen]
     if (_outside(whole, inner, is_rack) & (whole.scores >= LEAST_TUBE_SCORE)).any():
         larger = look(image, looks.rack_px)
-        whole = _joined([_rows(whole, is_rack[whole.class_ids]), _rows(larger, ~is_rack[larger.class_ids])])
-    kept = [_rows(whole, is_rack[whole.class_ids] | _outside(whole, inner, is_rack))]
+        whole = _joined([whole.take(is_rack[whole.class_ids]), larger.take(~is_rack[larger.class_ids])])
+    kept = [whole.take(is_rack[whole.class_ids] | _outside(whole, inner, is_rack))]
     for box, own in zip(chosen, inner, strict=True):
         wide = _widened(box, 1.0)
         corner = np.maximum(np.floor(wide[:2]), 0).astype(int)
@@ -70,7 +70,7 @@ def look_twice(image: NDArray[np.uint8], look: Look, looks: Looks, is_rack: NDAr
             continue
         found = look(part, looks.rack_px)
         moved = RawBoxes(found.edges_xyxy + np.tile(corner, 2), found.scores, found.class_ids)
-        kept.append(_rows(moved, ~is_rack[moved.class_ids] & _centred_in(moved.edges_xyxy, own)))
+        kept.append(moved.take(~is_rack[moved.class_ids] & _centred_in(moved.edges_xyxy, own)))
     return _joined(kept)
 
 
@@ -98,10 +98,6 @@ def _distinct(edges_xyxy: FloatArray, rows: NDArray[np.intp]) -> NDArray[np.intp
 def _centred_in(edges_xyxy: FloatArray, box: FloatArray) -> NDArray[np.bool_]:
     middle = (edges_xyxy[:, :2] + edges_xyxy[:, 2:]) / 2
     return np.asarray(((middle >= box[:2]) & (middle <= box[2:])).all(axis=1))
-
-
-def _rows(boxes: RawBoxes, chosen: NDArray[np.bool_]) -> RawBoxes:
-    return RawBoxes(boxes.edges_xyxy[chosen], boxes.scores[chosen], boxes.class_ids[chosen])
 
 
 def _joined(parts: Sequence[RawBoxes]) -> RawBoxes:

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from tubepose.capture.frame import RgbdFrame
 from tubepose.detection.boxes import box_from_edges, class_words
-from tubepose.detection.closer_look import look_twice
+from tubepose.detection.closer_look import LEAST_TUBE_SCORE, look_twice
 from tubepose.detection.model import RACK_CLASS, Detection
 from tubepose.detection.yolo_decoding import (
     LAYOUT_SHAPES,
@@ -86,6 +86,8 @@ class YoloDetector:
         # One group for tubes, one for racks: a tube has one type, but a rack lies behind all of its tubes.
         self._is_rack = np.array([word == RACK_CLASS for word in self._words])
         self.looks = self._session.metadata.looks if self._session.any_size and image_size is None else None
+        # What decides about a larger look must not depend on what is wanted in the end.
+        self._decoded_from = min(score_threshold, LEAST_TUBE_SCORE) if self.looks is not None else score_threshold
 
     @property
     def words(self) -> tuple[str, ...]:
@@ -120,6 +122,7 @@ class YoloDetector:
             boxes = self._look(image, self.net_size)
         else:
             boxes = look_twice(image, self._look_rectangular, self.looks, self._is_rack)
+            boxes = boxes.take(boxes.scores >= self._score_threshold)
         found = []
         for row in suppress(boxes, self._is_rack[boxes.class_ids].astype(np.intp), self._iou_threshold):
             box = box_from_edges(boxes.edges_xyxy[row], size)
@@ -145,7 +148,7 @@ class YoloDetector:
     def _boxes(self, outputs: list[NDArray[np.floating]], net_size: tuple[int, int]) -> RawBoxes:
         path = self._session.path
         try:
-            boxes = decode(outputs[self._output_index][0], self.layout, net_size, self._score_threshold)
+            boxes = decode(outputs[self._output_index][0], self.layout, net_size, self._decoded_from)
         except DetectorError as problem:
             raise DetectorError(f"{path}: {problem}") from None
         if boxes.class_ids.size and boxes.class_ids.max() >= len(self.classes):

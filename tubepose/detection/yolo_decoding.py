@@ -40,6 +40,10 @@ class RawBoxes:
     scores: FloatArray
     class_ids: NDArray[np.intp]
 
+    def take(self, chosen: NDArray[np.bool_]) -> RawBoxes:
+        """The same of some of the boxes."""
+        return RawBoxes(self.edges_xyxy[chosen], self.scores[chosen], self.class_ids[chosen])
+
 
 def anchor_count(net_size: tuple[int, int], strides: tuple[int, ...]) -> int:
     """Number of grid cells over all levels for a network input of (width, height) pixels."""
