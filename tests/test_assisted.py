@@ -103,7 +103,7 @@ def test_a_tube_that_the_network_did_not_see_is_added_from_the_cloud(frame):
     assert [detection.source for detection in scene.detections] == ["yolo"] * len(boxes) + ["geometric"]
     assert scene.detections[-1].note == "the network saw no tube there"
     assert sorted(target.slot for target in scene.targets) == sorted(PLACED)
-    # Doubtful boxes that are a little off cost no points: they are the cloud's. Sure ones keep their own.
+    # Doubtful boxes that are a little off cost no points: they are the cloud's. Sure ones keep what is in them.
     counts = {}
     for score, shift in ((0.4, 0.0), (0.4, 4.0), (0.9, 4.0)):
         off = [replace(box, score=score, box_xyxy_px=tuple(np.add(box.box_xyxy_px, shift))) for box in boxes]
@@ -123,6 +123,33 @@ def test_a_tube_that_the_network_did_not_see_is_added_from_the_cloud(frame):
     # Nobody asks for tubes one by one: nothing is looked for.
     alone = prepare_scene(frame, RACK, TUBES, assisted(rack_box(0.9)), CONFIG, methods=("profile",))
     assert len(alone.detections) == 1
+
+
+@pytest.mark.parametrize("name", [CAPPED_CLASS, OPEN_CLASS])
+def test_a_sure_box_that_holds_neighbours_too_gives_a_closed_tube_its_own_points_alone(frame, name):
+    tubes = GeometricDetector(RACK, TUBES, CONFIG).tubes_on(frame, T_CAMERA_RACK)
+    wide = []
+    for tube in tubes:
+        left, top, right, bottom = tube.box_xyxy_px
+        more = 0.4 * min(right - left, bottom - top)
+        wide.append(Detection(name, 0.9, (left - more, top - more, right + more, bottom + more), "yolo"))
+    assert any(len(rows_in_box(frame, box)) > 1.2 * len(tube.point_rows) for box, tube in zip(wide, tubes, strict=True))
+    found = assisted(*wide).checked(frame, T_CAMERA_RACK, tuple(wide))
+    for box, tube in zip(found, tubes, strict=True):
+        if name == OPEN_CLASS:
+            assert box.point_rows is None
+        else:
+            assert set(box.point_rows) <= set(tube.point_rows)
+            assert len(box.point_rows) > 0.9 * len(tube.point_rows)
+
+
+def test_a_sure_box_that_holds_hardly_anything_of_its_tube_gets_the_tubes_points(frame):
+    tube = GeometricDetector(RACK, TUBES, CONFIG).tubes_on(frame, T_CAMERA_RACK)[0]
+    left, top, right, bottom = tube.box_xyxy_px
+    sliver = Detection(CAPPED_CLASS, 0.9, (left, top, left + 0.25 * (right - left), bottom), "yolo")
+    (found, *_) = assisted(sliver).checked(frame, T_CAMERA_RACK, (sliver,))
+    assert 0 < len(rows_in_box(frame, sliver)) < 0.3 * len(tube.point_rows)
+    assert np.array_equal(found.point_rows, tube.point_rows)
 
 
 def test_where_the_cloud_does_not_help_either_the_first_answer_stays(frame):

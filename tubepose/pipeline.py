@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import TypeGuard
 
 import numpy as np
 from numpy.typing import NDArray
@@ -134,17 +135,24 @@ def prepare_scene(
     intrinsics = frame.intrinsics
     if intrinsics is None and frame.organised:
         intrinsics = estimate_intrinsics(frame.cloud_m)
+
+    def registered(boxes: Sequence[Detection]) -> RackPose:
+        with clock.stage("rack"):
+            return _rack_pose(frame, rack, boxes, config, hint, intrinsics)
+
     with clock.stage("detect"):
         detections = detector.detect(frame)
     if T_camera_rack is not None:
         rack_pose = RackPose(RackStatus.OK, T_camera_rack=T_camera_rack, resolved_by="given")
     else:
-        with clock.stage("rack"):
-            rack_pose = _rack_pose(frame, rack, detections, config, hint, intrinsics)
-        if rack_pose.T_camera_rack is None and isinstance(detector, AssistedDetector):
-            detections, rack_pose = _second_opinion(
-                detector, frame, rack, detections, rack_pose, config, hint, intrinsics, clock
-            )
+        rack_pose = registered(detections)
+        if rack_pose.T_camera_rack is None and _may_be_helped(detector, detections):
+            with clock.stage("detect"):
+                others = detector.second_opinion(frame, rack_pose.reason)
+            other_pose = registered(others)
+            # Where that fails too, the first answer stays.
+            if other_pose.T_camera_rack is not None:
+                detections, rack_pose = others, other_pose
     targets: tuple[TubeTarget, ...] = ()
     if rack_pose.T_camera_rack is not None and any(method in TUBE_METHODS for method in methods):
         if isinstance(detector, AssistedDetector):
@@ -257,25 +265,10 @@ def _rack_pose(
     return register_rack(frame.points_m[rows_in_box(frame, best, RACK_MARGIN)], rack, config, hint, intrinsics)
 
 
-def _second_opinion(
-    detector: AssistedDetector,
-    frame: RgbdFrame,
-    rack: RackModel,
-    detections: tuple[Detection, ...],
-    rack_pose: RackPose,
-    config: Config,
-    hint: SlotHint | None,
-    intrinsics: CameraIntrinsics | None,
-    clock: Clock,
-) -> tuple[tuple[Detection, ...], RackPose]:
-    """Boxes and pose by the cloud's geometry where the network's rack has none; as they were where that fails too."""
-    if any(detection.is_rack and detection.source == "geometric" for detection in detections):
-        return detections, rack_pose
-    with clock.stage("detect"):
-        others = detector.second_opinion(frame, rack_pose.reason)
-    with clock.stage("rack"):
-        other_pose = _rack_pose(frame, rack, others, config, hint, intrinsics)
-    return (others, other_pose) if other_pose.T_camera_rack is not None else (detections, rack_pose)
+def _may_be_helped(detector: Detector, detections: Sequence[Detection]) -> TypeGuard[AssistedDetector]:
+    """Whether the cloud's geometry, which may find the network's rack, has not been asked yet."""
+    asked = any(detection.is_rack and detection.source == "geometric" for detection in detections)
+    return isinstance(detector, AssistedDetector) and not asked
 
 
 def _targets(

@@ -5,13 +5,14 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
 from tubepose.capture.frame import RgbdFrame
 from tubepose.detection.boxes import edges_from_box
 from tubepose.detection.geometric import GeometricDetector
 from tubepose.detection.metrics import overlaps
-from tubepose.detection.model import Detection
+from tubepose.detection.model import CAPPED_CLASS, Detection, rows_in_box
 from tubepose.detection.yolo import YoloDetector
 from tubepose.transforms import FloatArray
 
@@ -19,6 +20,8 @@ SURE_SCORE = 0.5
 """A rack that a network gives less than this is looked for in the cloud too, a tube must be seen there."""
 KNOWN_SHARE = 0.2
 """Least overlap of a network's box and of a tube of the cloud (intersection over union) that can be one."""
+LEAST_COMMON = 0.3
+"""A box that holds less than this share of its tube's points is off."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,9 +60,11 @@ class AssistedDetector:
     ) -> tuple[Detection, ...]:
         """Boxes of tubes against what stands on a registered rack: one box, one tube.
 
-        A tube that both see keeps the network's box, class and score; if the network is unsure of it, it gets the
-        points of the cloud's tube: a box that is off would cut some away. A tube of the cloud without a box of its
-        own is added. A tube's box without a tube of the cloud stays if the network is sure of it.
+        A tube that both see keeps the network's box, class and score. If the network is unsure of it, it gets the
+        points of the cloud's tube: a box that is off would cut some away. A box of a closed tube keeps those of its
+        points that are of the cloud's tube too: others are of neighbours. What the cloud makes of openings is no better
+        than their boxes. A tube of the cloud without a box of its own is added. A tube's box without a tube of the
+        cloud stays if the network is sure of it.
 
         Args:
             frame: The frame.
@@ -80,7 +85,7 @@ class AssistedDetector:
         pairs = [(k, m) for k, m in zip(*linear_sum_assignment(-shares), strict=True) if shares[k, m] >= KNOWN_SHARE]
         seen = {told[int(m)]: standing[int(k)] for k, m in pairs}
         kept = [
-            replace(box, point_rows=seen[k].point_rows) if k in seen and box.score < SURE_SCORE else box
+            replace(box, point_rows=_rows_of_both(frame, box, seen[k])) if k in seen else box
             for k, box in enumerate(found)
             if k not in told or k in seen or box.score >= SURE_SCORE
         ]
@@ -93,3 +98,13 @@ class AssistedDetector:
 
 def _rack_score(found: tuple[Detection, ...]) -> float:
     return max((detection.score for detection in found if detection.is_rack), default=0.0)
+
+
+def _rows_of_both(frame: RgbdFrame, box: Detection, tube: Detection) -> NDArray[np.intp] | None:
+    """Rows of a tube that network and cloud see, None for all in the network's box; see `AssistedDetector.checked`."""
+    if tube.point_rows is None or box.score < SURE_SCORE:
+        return tube.point_rows
+    if box.class_name != CAPPED_CLASS:
+        return None
+    common = np.intersect1d(rows_in_box(frame, box), tube.point_rows, assume_unique=True)
+    return common if len(common) >= LEAST_COMMON * len(tube.point_rows) else tube.point_rows
