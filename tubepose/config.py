@@ -183,6 +183,8 @@ class ProfileConfig(_Section):
         min_support: Least share of a top that is seen, less the share of its surroundings.
         min_rim_support: The same of an open rim.
         min_rim_evidence: Least product of a rim's support and of the share of its ring that is seen in the image.
+        min_ring_votes: Least share of directions, less those against, in which the image shows a rim without points.
+        min_ring_contrast: Least mean correlation of such a rim's sectors with a ring's.
         min_sectors: Least share of a top's circle whose end is seen.
         reach_m: Added to what a slot lets a tube's top reach, for the rack's error and for looser slots.
         plane_points: Points of a top that its plane is fitted to.
@@ -214,6 +216,8 @@ class ProfileConfig(_Section):
     min_support: float = 0.3
     min_rim_support: float = 0.1
     min_rim_evidence: float = 0.11
+    min_ring_votes: float = 0.5
+    min_ring_contrast: float = 0.62
     min_sectors: float = 0.4
     reach_m: float = 1.5e-3
     plane_points: int = 400

@@ -197,3 +197,29 @@ def wall_sums(residual_m, normal, above_m, of, pose, weight, near_m):
             for j in range(5):
                 matrix[t, i, j] += w * row[i] * row[j]
     return matrix, vector
+
+
+@compiled
+def ring_votes(picture, cells, shifts, ring, inside, outside, least):
+    """Most votes (S,) for a bright ring about cells (S, 2), and with which of the shifts (M, 2) of its middle, (S,).
+
+    `ring`, `inside` and `outside` are cells (D, 2) of directions from a middle. A direction votes by how much brighter
+    its cell on the ring is than the two beside it, over their differences, a least one included: 1 if it is brighter
+    than both, -1 if darker, near 0 on an edge. Nothing is read outside of the picture.
+    """
+    votes, best = np.full(len(cells), -1.0), np.zeros(len(cells), np.intp)
+    height, width = picture.shape
+    for s in range(len(cells)):
+        for m in range(len(shifts)):
+            i, j = cells[s, 0] + shifts[m, 0], cells[s, 1] + shifts[m, 1]
+            total = 0.0
+            for d in range(len(ring)):
+                if not (0 <= i + outside[d, 0] < height and 0 <= j + outside[d, 1] < width):
+                    continue
+                middle = picture[i + ring[d, 0], j + ring[d, 1]]
+                inner = middle - picture[i + inside[d, 0], j + inside[d, 1]]
+                outer = middle - picture[i + outside[d, 0], j + outside[d, 1]]
+                total += (inner + outer) / (abs(inner) + abs(outer) + least)
+            if total > votes[s] * len(ring):
+                votes[s], best[s] = total / len(ring), m
+    return votes, best

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial, reduce
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,12 +12,22 @@ from numpy.typing import NDArray
 from tubepose.capture.frame import CameraIntrinsics, RgbdFrame
 from tubepose.config import Config, ProfileConfig
 from tubepose.labware import RackModel, TubeModel
+from tubepose.profile.faint_rims import find_faint_rims
 from tubepose.profile.kernels import cell_values, ends_on_planes, near_planes, nearest_tops
 from tubepose.profile.outline import NORMALS, OUTLINE_DEPTH_M, SECTORS, Circles, fit_discs, unknown_circles
 from tubepose.profile.plane import TopPlanes, fit_top_planes
 from tubepose.profile.rims import fit_rims
 from tubepose.profile.standing import Standing, gather_standing
-from tubepose.profile.tops import Tops, find_tops, mouth_radius_m, top_level_m, top_radius_m
+from tubepose.profile.tops import (
+    Tops,
+    find_tops,
+    joined,
+    mouth_radius_m,
+    top_level_m,
+    top_radius_m,
+    top_reach_m,
+    without_overlaps,
+)
 from tubepose.transforms import FloatArray
 
 TALLER_M = 0.08
@@ -86,7 +97,12 @@ def measure_tops(
     alone = np.where(np.isfinite(rims.widening_m), RING_SUPPORT, config.profile.min_support)
     kept = ~shape.open | (tops.support > alone)
     kept |= rims.sectors * tops.support >= config.profile.min_rim_evidence
-    tops, shape, rims = tops.take(kept), shape.take(kept), rims.take(kept)
+    tops, rims = tops.take(kept), rims.take(kept)
+    if frame.image is not None and frame.organised and intrinsics is not None:
+        tops, rims = _with_faint_rims(
+            frame, intrinsics, T_camera_rack, tops, rims, rack, tubes, config.profile, allowed
+        )
+    shape = _shapes(tops, tubes, rack)
     label = label_points(standing, tops.center_m, shape.radius_m)
     planes, discs = _measure_closed(standing, label, tops, shape, config.profile)
     circles = discs.where(~shape.open, rims)
@@ -102,9 +118,6 @@ class _Shapes:
     mouth_m: FloatArray
     level_m: FloatArray
     open: NDArray[np.bool_]
-
-    def take(self, keep: NDArray[np.bool_]) -> _Shapes:
-        return _Shapes(self.radius_m[keep], self.mouth_m[keep], self.level_m[keep], self.open[keep])
 
 
 def _shapes(tops: Tops, tubes: Sequence[TubeModel], rack: RackModel) -> _Shapes:
@@ -132,6 +145,58 @@ def _measure_rims(
     blocked = blocked_sectors(tops.center_m, shape.radius_m, RIM_GAP_M, sure)[at]
     rims = fit_rims(frame, intrinsics, T_camera_rack, tops.center_m[at], shape.level_m[at], radii, blocked, config)
     return circles.put(at, rims)
+
+
+def _with_faint_rims(
+    frame: RgbdFrame,
+    intrinsics: CameraIntrinsics,
+    T_camera_rack: FloatArray,
+    tops: Tops,
+    rims: Circles,
+    rack: RackModel,
+    tubes: Sequence[TubeModel],
+    config: ProfileConfig,
+    allowed: NDArray[np.bool_] | None,
+) -> tuple[Tops, Circles]:
+    """The same tops and circles, and those of open types that the image alone shows in the slots that are left."""
+    free = np.setdiff1d(np.arange(len(rack.all_slots)), tops.slot)
+    types = np.array([k for k, tube in enumerate(tubes) if tube.is_open], np.intp)
+    if len(free) == 0 or len(types) == 0:
+        return tops, rims
+    known = (tops.center_m, np.array([top_radius_m(tubes[k]) for k in tops.tube]))
+    seen = []
+    for tube in (tubes[k] for k in types):
+        radii = np.array([mouth_radius_m(tube), top_radius_m(tube)])
+        reach_m = max(top_reach_m(rack.all_slots[i], tube, rack) for i in free)
+        seen.append(
+            find_faint_rims(
+                frame, intrinsics, T_camera_rack, rack.slot_centers_m[free], reach_m, top_level_m(tube, rack), radii,
+                partial(_blocked_by, *known, float(radii[1])), config,
+            )
+        )  # fmt: skip
+    contrast = np.stack([one.contrast for one in seen])
+    if allowed is not None:
+        contrast = np.where(allowed[np.ix_(types, free)], contrast, -np.inf)
+    best, ranked = contrast.argmax(axis=0), np.sort(contrast, axis=0)
+    kind, place = np.full(len(rack.all_slots), -1), np.full((len(rack.all_slots), 3), -np.inf)
+    kind[tops.slot], place[tops.slot, 1:] = tops.tube, tops.center_m
+    kind[free], place[free, 0] = types[best], ranked[-1]
+    place[free, 1:] = np.stack([one.center_m for one in seen])[best, np.arange(len(free))]
+    chosen = without_overlaps(free[ranked[-1] >= config.min_ring_contrast], tops.slot, kind, place, tubes)
+    at = np.searchsorted(free, chosen)
+    second = ranked[-2, at] if len(types) > 1 else np.full(len(at), -np.inf)
+    new = Tops(chosen, kind[chosen], place[chosen, 1:], place[chosen, 0], second)
+    circles = [one.circles.take(at) for one in seen]
+    found = reduce(lambda low, k: circles[k].where(best[at] == k, low), range(1, len(types)), circles[0])
+    order = np.argsort(np.concatenate([tops.slot, chosen]), kind="stable")
+    return joined(tops, new).take(order), joined(rims, found).take(order)
+
+
+def _blocked_by(center_m: FloatArray, radius_m: FloatArray, own_m: float, place_m: FloatArray) -> NDArray[np.bool_]:
+    """Sectors (N, SECTORS) of tops of one radius at places (N, 2) that other tops, (T, 2), are too near to."""
+    radii = np.concatenate([np.full(len(place_m), own_m), radius_m])
+    sure = np.arange(len(radii)) >= len(place_m)
+    return blocked_sectors(np.vstack([place_m, center_m]), radii, RIM_GAP_M, sure)[: len(place_m)]
 
 
 def label_points(standing: Standing, center_m: FloatArray, radius_m: FloatArray) -> NDArray[np.intp]:

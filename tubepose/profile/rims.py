@@ -19,6 +19,8 @@ SEARCH_M = 0.9e-3
 ROUNDS = 2
 PER_SECTOR = 3
 """Radii along which a sector of the image is read."""
+NEAR_RING_M = 0.3e-3
+"""How far a sector of a ring may be from the circle that was fitted to all of them."""
 MIN_CONTRAST = 0.35
 """Correlation of a sector's brightness with a ring's, below which the sector does not count."""
 
@@ -64,6 +66,26 @@ def fit_rims(
     assert circles is not None
     offset = np.where(np.isfinite(circles.offset_m), shift, np.nan)
     return Circles(offset, circles.covariance_m2, circles.widening_m, circles.sectors)
+
+
+def ring_contrast(
+    frame: RgbdFrame,
+    intrinsics: CameraIntrinsics,
+    T_camera_rack: FloatArray,
+    center_m: FloatArray,
+    level_m: FloatArray,
+    radii_m: FloatArray,
+    blocked: NDArray[np.bool_],
+) -> FloatArray:
+    """Mean correlation of the sectors of circles, known to `NEAR_RING_M`, with a ring's; shape (T,), -1 to 1.
+
+    Arguments are those of `fit_rims`; sectors that are blocked do not count.
+    """
+    view = (brightness(frame), intrinsics, T_camera_rack)
+    profile, steps_m = _radial_profiles(*view, center_m, level_m, radii_m, SEARCH_M)
+    moves_m, _, correlation = _ring_scores(profile, steps_m, radii_m, SEARCH_M)
+    near = correlation[:, :, np.abs(moves_m) <= NEAR_RING_M].max(axis=2)
+    return np.asarray((near * ~blocked).sum(axis=1) / np.maximum((~blocked).sum(axis=1), 1))
 
 
 def brightness(frame: RgbdFrame) -> NDArray[np.float32] | NDArray[np.uint8]:

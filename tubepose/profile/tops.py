@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from functools import lru_cache
+from typing import TypeVar
 
 import cv2
 import numpy as np
@@ -13,6 +14,7 @@ from numpy.typing import NDArray
 from tubepose.config import ProfileConfig
 from tubepose.labware import RackModel, SlotModel, TubeModel
 from tubepose.profile.kernels import best_places, level_pictures
+from tubepose.profile.outline import Circles
 from tubepose.profile.standing import OUTSIDE_M, Standing
 from tubepose.transforms import FloatArray
 
@@ -41,9 +43,18 @@ class Tops:
     support: FloatArray
     runner_up: FloatArray
 
-    def take(self, keep: NDArray[np.bool_]) -> Tops:
+    def take(self, keep: NDArray[np.bool_] | NDArray[np.intp]) -> Tops:
         """The same of some of the tops."""
         return Tops(self.slot[keep], self.tube[keep], self.center_m[keep], self.support[keep], self.runner_up[keep])
+
+
+PerTube = TypeVar("PerTube", Tops, Circles)
+
+
+def joined(first: PerTube, second: PerTube) -> PerTube:
+    """Entries of one, then those of the other."""
+    names = [field.name for field in fields(first)]
+    return type(first)(*(np.concatenate([getattr(first, name), getattr(second, name)]) for name in names))
 
 
 def top_level_m(tube: TubeModel, rack: RackModel) -> float:
@@ -108,7 +119,7 @@ def find_tops(
         candidates = np.flatnonzero((best < 0) & (ranked[-1] > least))
         where = found[kind, np.arange(count)]
         taken = np.flatnonzero(best >= 0)
-        new = _without_overlaps(
+        new = without_overlaps(
             candidates, taken, np.where(best >= 0, best, kind), np.where((best >= 0)[:, None], place, where), tubes
         )
         if len(new) == 0:
@@ -197,7 +208,7 @@ def top_reach_m(slot: SlotModel, tube: TubeModel, rack: RackModel) -> float:
     return play + (room + play) * tube.height_m / min(rack.depth_m, tube.height_m)
 
 
-def _without_overlaps(
+def without_overlaps(
     slots: NDArray[np.intp],
     taken: NDArray[np.intp],
     kind: NDArray[np.intp],

@@ -1,0 +1,123 @@
+"""Rims that only the image shows: found where they are, told from edges, discs and noise, and from what others hide."""
+
+import numpy as np
+import pytest
+from test_profile_rims import CAMERA, INNER_M, LEVEL_M, OUTER_M, RACK, VIEW, drawn, frame_of, level_points
+
+from tubepose.config import Config, ProfileConfig
+from tubepose.labware import load_tube
+from tubepose.profile import fit_profiles
+from tubepose.profile.faint_rims import find_faint_rims
+from tubepose.profile.measure import blocked_sectors
+from tubepose.profile.outline import SECTORS
+from tubepose.transforms import invert_transform, transform_points
+
+CONFIG = ProfileConfig()
+SLOTS = ("B4", "C5", "D6")
+CENTERS_M = np.array([RACK.slot(name).center_m for name in SLOTS])
+REACH_M = 4e-3
+
+
+def free(place_m):
+    return np.zeros((len(place_m), SECTORS), bool)
+
+
+def look(image, centers_m=CENTERS_M, blocked_at=free, config=CONFIG):
+    return find_faint_rims(
+        frame_of(image), CAMERA, VIEW, centers_m, REACH_M, LEVEL_M, np.array([INNER_M, OUTER_M]), blocked_at, config
+    )
+
+
+@pytest.mark.parametrize("shift_mm", [(0.0, 0.0), (3.5, -1.0), (-2.0, 3.0)])
+def test_a_ring_without_a_single_point_is_measured_where_it_is(shift_mm):
+    place = CENTERS_M[1] + 1e-3 * np.array(shift_mm)
+    found = look(drawn(VIEW, place, clutter=15.0))
+    assert found.contrast[1] > 0.75
+    assert found.center_m[1] + found.circles.offset_m[1] == pytest.approx(place, abs=1e-4)
+    assert not (found.contrast[[0, 2]] > CONFIG.min_ring_contrast).any()
+
+
+def test_three_rings_are_three_rims():
+    places = CENTERS_M + np.array([[1e-3, 0.0], [0.0, 2e-3], [-2e-3, -2e-3]])
+    found = look(drawn(VIEW, *places))
+    assert (found.contrast > 0.8).all()
+    assert np.allclose(found.center_m + found.circles.offset_m, places, atol=1e-4)
+
+
+def painted(gray_of_rho):
+    """An image that depends on the distance from the middle of the slot C5 alone, at the rims' level."""
+    rho = np.hypot(*np.moveaxis(level_points(VIEW) - CENTERS_M[1], -1, 0))
+    image = gray_of_rho(rho).reshape(CAMERA.height, 3, CAMERA.width, 3).mean(axis=(1, 3))
+    return np.clip(image + np.random.default_rng(0).normal(0, 2, image.shape), 0, 255).astype(np.uint8)
+
+
+MIDDLE_M = (INNER_M + OUTER_M) / 2
+
+
+@pytest.mark.parametrize(
+    "gray_of_rho",
+    [
+        lambda rho: np.where(rho < MIDDLE_M, 160.0, 60.0),  # a disc as large as the rim
+        lambda rho: np.where(rho < MIDDLE_M, 60.0, 160.0),  # a hole
+        lambda rho: np.where((rho > INNER_M) & (rho < OUTER_M), 60.0, 160.0),  # a dark ring
+        lambda rho: np.where((rho > INNER_M - 4e-3) & (rho < OUTER_M - 4e-3), 160.0, 60.0),  # another size
+        lambda rho: np.full(rho.shape, 100.0),
+    ],
+)
+def test_what_is_no_bright_ring_of_that_size_is_no_rim(gray_of_rho):
+    assert not (look(painted(gray_of_rho)).contrast >= CONFIG.min_ring_contrast).any()
+
+
+def test_noise_is_no_rim():
+    rng = np.random.default_rng(3)
+    every = RACK.slot_centers_m
+    for _ in range(3):
+        image = rng.integers(0, 255, (CAMERA.height, CAMERA.width)).astype(np.uint8)
+        assert not (look(image, every).contrast >= CONFIG.min_ring_contrast).any()
+
+
+def test_a_rim_that_other_tops_are_near_to_on_too_many_sides_is_not_told_of():
+    image = drawn(VIEW, CENTERS_M[1])
+
+    def beside(count):
+        angles = np.arange(count) * 2 * np.pi / 6
+        others = CENTERS_M[1] + 2 * OUTER_M * np.column_stack([np.cos(angles), np.sin(angles)])
+
+        def blocked_at(place_m):
+            tops = np.vstack([place_m, others])
+            sure = np.arange(len(tops)) >= len(place_m)
+            return blocked_sectors(tops, np.full(len(tops), OUTER_M), 6e-4, sure)[: len(place_m)]
+
+        return look(image, blocked_at=blocked_at).contrast[1]
+
+    assert beside(1) > 0.75
+    assert beside(6) == -np.inf
+
+
+def test_beyond_the_picture_there_is_nothing():
+    far = CENTERS_M + np.array([[0.5, 0.5]])
+    found = look(drawn(VIEW, CENTERS_M[1]), far)
+    assert np.all(found.contrast == -np.inf)
+    assert np.isnan(found.circles.offset_m).all()
+
+
+def test_a_tube_whose_rim_only_the_image_shows_gets_a_pose_and_no_other_slot_does():
+    """`fit_profiles` on a cloud without a point above the rack: the image alone speaks for the tube."""
+    tube = load_tube("chen2023-tube-1")
+    level_m = RACK.floor_m + tube.height_m
+    place = RACK.slot("C5").center_m + np.array([0.4e-3, -0.3e-3])
+    xy = level_points(VIEW, level_m)
+    rho = np.hypot(*np.moveaxis(xy - place, -1, 0))
+    outer = float(tube.body_radius_m(tube.rim_height_m)) if tube.cap is None else tube.cap.diameter_mm * 0.5e-3
+    inner = float(tube.body_radius_m(tube.rim_height_m)) - tube.body.wall_mm * 1e-3
+    gray = np.where((rho > inner) & (rho < outer), 160.0, 60.0)
+    image = gray.reshape(CAMERA.height, 3, CAMERA.width, 3).mean(axis=(1, 3)).astype(np.uint8)
+    for shown, slots in ((image, ["C5"]), (np.full_like(image, 60), [])):
+        frame = frame_of(shown, np.full((CAMERA.height, CAMERA.width, 3), np.nan))
+        found = fit_profiles(frame, CAMERA, VIEW, RACK, [tube], Config())
+        assert [entry.slot for entry in found if entry.pose.status == "ok"] == slots
+        for entry in found:
+            top = transform_points(entry.pose.T_rack_tube, np.array([[0.0, 0.0, tube.height_m]]))[0]
+            assert top[:2] == pytest.approx(place, abs=2e-4)
+            assert len(entry.points_m) == 0
+    assert invert_transform(VIEW)[2, 3] > level_m  # the camera stands above the rims

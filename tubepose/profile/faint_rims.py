@@ -1,0 +1,141 @@
+"""Rims that the image shows and the cloud does not: those of clear plastic, which hardly returns a point.
+
+The image is laid onto the level of the rims, where all of them are circles of one size. About every slot each place
+that a rim can have is judged by votes of directions: for a ring that is brighter than both of its sides, against one
+that is darker, nothing for an edge. The best place of a slot that wins enough of them is then measured as any rim is,
+and believed if nearly all of its circle is free to be seen and looks like a ring. Neither test knows of the other: the
+votes see whether a side is brighter and not by how much, the correlation how a ring's whole width looks.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from tubepose.capture.frame import CameraIntrinsics, RgbdFrame
+from tubepose.config import ProfileConfig
+from tubepose.profile.fit_kernels import ring_votes
+from tubepose.profile.outline import Circles, unknown_circles
+from tubepose.profile.rims import brightness, fit_rims, ring_contrast
+from tubepose.transforms import FloatArray
+
+CELL_M = 0.4e-3
+COARSE = 2
+"""Every so many cells a place is judged first; then those around the best of them."""
+DIRECTIONS = 48
+LEAST_FREE = 0.75
+"""Least share of a circle that no other top is near to."""
+EDGE_M = 20e-3
+"""How far beyond the middles of slots the image is laid out."""
+LEAST_GRAY = 0.02
+"""Differences under this share of the picture's range are noise."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FaintRims:
+    """What the image shows in slots, S of them.
+
+    Attributes:
+        center_m: Middle of each rim before it was measured, rack frame, shape (S, 2), metres.
+        circles: The measured circles, about those middles.
+        contrast: Mean correlation of the circle's sectors with a ring's, shape (S,); -inf where no ring was found.
+    """
+
+    center_m: FloatArray
+    circles: Circles
+    contrast: FloatArray
+
+
+def find_faint_rims(
+    frame: RgbdFrame,
+    intrinsics: CameraIntrinsics,
+    T_camera_rack: FloatArray,
+    center_m: FloatArray,
+    reach_m: float,
+    level_m: float,
+    radii_m: FloatArray,
+    blocked_at: Callable[[FloatArray], NDArray[np.bool_]],
+    config: ProfileConfig,
+) -> FaintRims:
+    """Look for a rim in each of some slots.
+
+    Args:
+        frame: The frame, organised, with an image.
+        intrinsics: Of its image.
+        T_camera_rack: The rack's pose, shape (4, 4), metres.
+        center_m: Middles of the slots, rack frame, shape (S, 2), metres.
+        reach_m: How far from there a rim's middle can be, metres.
+        level_m: Height of the rims above the rack's base.
+        radii_m: Inner and outer radius of the rims, shape (2,).
+        blocked_at: From middles of rims, shape (N, 2), to the sectors that other tops are too near to, (N, SECTORS).
+        config: Limits, and noise of outlines.
+    """
+    middle, votes = _likeliest(frame, intrinsics, T_camera_rack, center_m, reach_m, level_m, radii_m)
+    circles, contrast = unknown_circles(len(center_m)), np.full(len(center_m), -np.inf)
+    at = np.flatnonzero(votes >= config.min_ring_votes)
+    if len(at) == 0:
+        return FaintRims(middle, circles, contrast)
+    view = (frame, intrinsics, T_camera_rack)
+    size = (np.full(len(at), level_m), np.tile(radii_m, (len(at), 1)))
+    found = fit_rims(*view, middle[at], *size, blocked_at(middle[at]), config)
+    place = middle[at] + np.nan_to_num(found.offset_m)
+    blocked = blocked_at(place)
+    seen = np.isfinite(found.offset_m[:, 0]) & ((~blocked).mean(axis=1) >= LEAST_FREE)
+    contrast[at] = np.where(seen, ring_contrast(*view, place, *size, blocked), -np.inf)
+    return FaintRims(middle, circles.put(at, found), contrast)
+
+
+def _likeliest(
+    frame: RgbdFrame,
+    intrinsics: CameraIntrinsics,
+    T_camera_rack: FloatArray,
+    center_m: FloatArray,
+    reach_m: float,
+    level_m: float,
+    radii_m: FloatArray,
+) -> tuple[FloatArray, FloatArray]:
+    """Place of each slot that wins most votes, shape (S, 2), metres, and those votes, -1 to 1, shape (S,)."""
+    low = center_m.min(axis=0) - EDGE_M
+    picture = _laid_out(frame, intrinsics, T_camera_rack, low, center_m.max(axis=0) + EDGE_M, level_m)
+    angles = (np.arange(DIRECTIONS) + 0.5) * (2 * np.pi / DIRECTIONS)
+    around = np.column_stack([np.cos(angles), np.sin(angles)])
+    middle_m, width_m = float(np.mean(radii_m)), float(np.ptp(radii_m))
+    ring, inside, outside = (
+        np.rint((middle_m + step) / CELL_M * around).astype(np.intp) for step in (0.0, -width_m, width_m)
+    )
+    least = LEAST_GRAY * float(np.ptp(picture)) + 1e-6
+    cells = np.rint((center_m - low) / CELL_M).astype(np.intp)
+    _, best = ring_votes(picture, cells, _disc(reach_m, COARSE), ring, inside, outside, least)
+    cells = cells + _disc(reach_m, COARSE)[best]
+    votes, best = ring_votes(picture, cells, _disc(COARSE * CELL_M, 1), ring, inside, outside, least)
+    return low + (cells + _disc(COARSE * CELL_M, 1)[best]) * CELL_M, votes
+
+
+def _disc(reach_m: float, step: int) -> NDArray[np.intp]:
+    """Every `step`-th cell of a disc, (M, 2), the middle among them."""
+    axis = step * np.arange(-int(reach_m / CELL_M / step), int(reach_m / CELL_M / step) + 1)
+    cells = np.stack(np.meshgrid(axis, axis), axis=-1).reshape(-1, 2)
+    return np.asarray(cells[np.hypot(*cells.T) * CELL_M <= reach_m + 1e-9], np.intp)
+
+
+def _laid_out(
+    frame: RgbdFrame,
+    intrinsics: CameraIntrinsics,
+    T_camera_rack: FloatArray,
+    low_m: FloatArray,
+    high_m: FloatArray,
+    level_m: float,
+) -> NDArray[np.float32]:
+    """The image on a level of the rack, cells (X, Y) of `CELL_M`, the first at `low_m`; what is not seen is black."""
+    rows, columns = (int(cells) for cells in np.ceil((high_m - low_m) / CELL_M) + 1)
+    R, t = T_camera_rack[:3, :3], T_camera_rack[:3, 3]
+    K = np.array([[intrinsics.fx, 0, intrinsics.cx], [0, intrinsics.fy, intrinsics.cy], [0, 0, 1.0]])
+    # A column of the picture goes along the rack's y, a row along its x.
+    to_camera = np.column_stack([R[:, 1] * CELL_M, R[:, 0] * CELL_M, R @ [*low_m, level_m] + t])
+    source = np.asarray(brightness(frame), np.float32)
+    flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+    return np.asarray(cv2.warpPerspective(source, K @ to_camera, (columns, rows), flags=flags), np.float32)
