@@ -23,6 +23,7 @@ STAGES: dict[str, tuple[ModuleType, tuple[str, ...]]] = {
     "planes": (measure, ("fit_top_planes",)),
     "outlines": (measure, ("fit_discs",)),
     "rims": (measure, ("fit_rims",)),
+    "faint rims": (measure, ("find_faint_rims",)),
     "leftovers": (estimate, ("find_leftovers",)),
     "posterior": (estimate, ("top_evidence", "combine", "pose_covariance")),
     "walls": (estimate, ("wall_evidence",)),
