@@ -4,11 +4,12 @@ import numpy as np
 import pytest
 import scenes
 
+from tubepose import rack_edges
 from tubepose.config import Config
 from tubepose.labware import load_rack, load_tube
 from tubepose.rack import RackStatus, register_rack
 from tubepose.rack_field import top_field
-from tubepose.transforms import HALF_TURN, invert_transform, transform_points
+from tubepose.transforms import HALF_TURN, invert_transform, make_transform, transform_points
 
 CONFIG = Config()
 SOFT = load_rack("chen2023-soft-5x10")
@@ -124,3 +125,19 @@ def test_the_covariance_holds_what_repeated_scans_do():
         turn_deg, shift_mm = error(pose)
         assert turn_deg < 3 * np.rad2deg(np.sqrt(np.trace(pose.covariance[:3, :3])))
         assert shift_mm < 3e3 * np.sqrt(np.trace(pose.covariance[3:, 3:]))
+
+
+@pytest.mark.parametrize("slots_off", [(0, 0), (2, 0), (-1, 1)])
+def test_a_start_some_slots_off_is_moved_before_it_is_refined(monkeypatch, slots_off):
+    fits = []
+    refine = rack_edges.refine
+    monkeypatch.setattr(rack_edges, "refine", lambda *args: fits.append(1) or refine(*args))
+    assert SOFT.grid is not None
+    off = make_transform(np.eye(3), np.array([*(np.multiply(slots_off, SOFT.grid.pitch_mm) * 1e-3), 0.0]))
+    points = transform_points(T_TRUE, hidden_by(TOP, SOFT.all_slots[5:30], 9e-3))
+    found = rack_edges.register_at(points, T_TRUE @ off, SOFT, CONFIG.rack)
+    degrees, millimetres = error(found.fit)
+    assert degrees < 0.05
+    assert millimetres < 0.05
+    assert found.reason == ""
+    assert len(fits) == 1
