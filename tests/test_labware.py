@@ -380,3 +380,32 @@ def test_section_shows_every_slot_that_it_cuts() -> None:
     cut = {text.get_text() for text in figure.axes[1].texts}
     assert {"A1", "A2", "A3", "A4"} <= cut
     assert not {"B1", "C1", "B3"} & cut
+
+
+def test_two_readings_of_a_file_are_the_same_rack_whatever_was_computed_of_them():
+    path = Path(str(files("tubepose.labware") / "catalogue" / "steel-round-13mm-5x10.yaml"))
+    first, second = read_labware(path), read_labware(path)
+    assert first.slot_centers_m.shape == second.slot_centers_m.shape  # kept in both from now on
+    assert first == second
+    assert len({first, second}) == 1
+    assert first != first.model_copy(update={"name": "another"})
+    assert first != "steel-round-13mm-5x10"
+
+
+@pytest.mark.parametrize("kind", ["[rack]", "{rack: 1}", "3", "racks"])
+def test_a_kind_that_is_none_is_one_line(tmp_path, kind):
+    (tmp_path / "r.yaml").write_text(f"kind: {kind}\nname: r\n")
+    with pytest.raises(LabwareError, match="expected 'kind: rack', 'kind: tube' or 'kind: cap', found"):
+        read_labware(tmp_path / "r.yaml")
+
+
+@pytest.mark.parametrize("value", [".inf", ".nan", "-.inf"])
+def test_no_length_is_infinite(tmp_path, value):
+    text = (
+        (files("tubepose.labware") / "catalogue" / "chen2023-tube-2.yaml")
+        .read_text()
+        .replace("height_mm:", f"height_mm: {value} #", 1)
+    )
+    (tmp_path / "t.yaml").write_text(text)
+    with pytest.raises(LabwareError, match="finite number"):
+        read_labware(tmp_path / "t.yaml")

@@ -2,6 +2,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
+import cv2
 import numpy as np
 import pytest
 import scenes
@@ -11,7 +12,7 @@ from tubepose.config import Config
 from tubepose.detection import Detection
 from tubepose.labware import load_rack, load_tube
 from tubepose.pipeline import Scene, TubeEstimate, estimate_tubes, prepare_scene
-from tubepose.report.overlay import COLORS_BGR, WIDTH_PX, Picture, draw_overlay
+from tubepose.report.overlay import COLORS_BGR, WIDTH_PX, Picture, _ImageView, draw_overlay
 from tubepose.transforms import FloatArray, transform_points
 from tubepose.tube import TubeStatus
 
@@ -133,3 +134,21 @@ def test_drawing_changes_nothing() -> None:
     assert np.array_equal(first, second)
     assert np.array_equal(SCENE.frame.cloud_m, cloud, equal_nan=True)
     assert np.array_equal(pose, kept)
+
+
+@pytest.mark.parametrize("count", [0, 5])
+def test_a_cloud_without_a_single_measurement_has_a_picture_too(count):
+    frame = scenes.unorganised(np.full((count, 3), np.nan))
+    scene = prepare_scene(frame, RACK, (TUBE,), Fixed(()), CONFIG)
+    assert draw_overlay(scene, ()).shape[1] > 0
+
+
+def test_drawn_marks_lie_on_the_middle_of_the_pixel_that_they_mark():
+    """An enlarged picture shows pixel k from k z to (k + 1) z: its middle is half a pixel from its corner."""
+    image = np.zeros((40, 60), np.uint8)
+    image[20, 30] = 255
+    zoom = 8.0
+    view = _ImageView(replace(SCENE, intrinsics=scenes.CAMERA), np.array([10.0, 5.0]), zoom)
+    picture = cv2.resize(image[5:, 10:], None, fx=zoom, fy=zoom, interpolation=cv2.INTER_CUBIC)
+    v, u = np.unravel_index(cv2.GaussianBlur(picture, (0, 0), 2).argmax(), picture.shape)
+    assert np.abs(np.array(view.pixel((30.0, 20.0))) - (u, v)).max() <= 1

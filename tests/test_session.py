@@ -110,5 +110,5 @@ def test_missing_and_broken_files_are_refused(tmp_path):
     with pytest.raises(CaptureError, match="not valid YAML"):
         load_session(tmp_path)
     (tmp_path / "session.yaml").write_text("- a\n", encoding="utf-8")
-    with pytest.raises(CaptureError, match="expected a mapping of keys to values, found list"):
+    with pytest.raises(CaptureError, match="expected a mapping of keys to values, found a list"):
         load_session(tmp_path)

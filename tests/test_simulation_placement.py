@@ -126,3 +126,21 @@ def test_printed_cap_stands_on_the_rim_at_its_offset():
     cap_points = vertices(upright, CAP)[-1]
     assert cap_points[:, 2].max() == pytest.approx(CAP.offset_m(model))
     assert cap_points[:, 2].min() == pytest.approx(model.rim_height_m)
+
+
+@pytest.mark.parametrize(
+    ("rack_name", "tube_name"),
+    [
+        ("steel-round-16mm-5x10", "blood-13x100"),
+        ("round-10ml-3x4", "centrifuge-10ml"),
+        ("chen2023-soft-5x10", "chen2023-tube-2"),
+    ],
+)
+def test_no_leaning_body_cuts_into_the_wall_of_its_slot(rack_name, tube_name):
+    """At the rack's top, where a body stands nearest to the wall, whatever the profile's points are."""
+    rack, tube = load_rack(rack_name), load_tube(tube_name)
+    rng, slot = np.random.default_rng(3), rack.all_slots[0]
+    for _ in range(400):
+        T = lean(rack, slot, tube, rng)
+        at_top = T[:2, 3] + (rack.height_m - T[2, 3]) / T[2, 2] * T[:2, 2]
+        assert -slot.signed_distance_m(at_top) > float(tube.body_radius_m(rack.depth_m))

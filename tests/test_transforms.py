@@ -8,6 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from tubepose.transforms import (
     axis_rotation,
+    axis_rotations,
     invert_transform,
     make_transform,
     quaternion_wxyz,
@@ -40,6 +41,11 @@ def test_alpha_leans_along_minus_y_and_beta_along_x():
 def test_axis_rotation_gives_back_the_rotation_of_eq_1(alpha, beta):
     R = tilt_rotation(alpha, beta)
     assert np.allclose(axis_rotation(3.0 * R[:, 2]), R, atol=1e-9)
+
+
+def test_many_axes_at_once_are_turned_as_each_alone():
+    axes = np.vstack([np.random.default_rng(2).normal(size=(50, 3)), np.eye(3)])
+    assert np.allclose(axis_rotations(axes), [axis_rotation(axis) for axis in axes], atol=1e-12)
 
 
 def test_axis_rotation_of_a_tube_upside_down_is_a_rotation_with_that_axis():

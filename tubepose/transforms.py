@@ -47,11 +47,14 @@ def axis_rotation(axis: FloatArray) -> FloatArray:
     Args:
         axis: Array of shape (3,), rack frame; normalised here.
     """
-    return np.asarray(axis_rotations(np.asarray(axis, dtype=float)[None])[0])
+    x, y, z = np.asarray(axis, dtype=float) / np.linalg.norm(axis)
+    alpha = float(np.arctan2(-y, np.hypot(x, z)))
+    beta = float(np.arctan2(x, z))
+    return tilt_rotation(alpha, beta)
 
 
 def axis_rotations(axes: FloatArray) -> FloatArray:
-    """`axis_rotation` of many axes (N, 3) at once, shape (N, 3, 3)."""
+    """`axis_rotation` of many axes (N, 3) at once, shape (N, 3, 3), without the angles: equal but for rounding."""
     x, y, z = (axes / np.linalg.norm(axes, axis=1, keepdims=True)).T
     flat = np.hypot(x, z)
     # An axis along y has no part in the x-z plane, and no turn about y.

@@ -22,4 +22,13 @@ NonNegative = Annotated[float, Field(ge=0)]
 class Definition(BaseModel):
     """Base of every definition and of its parts: frozen, and strict about unknown keys."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True, ignored_types=(cached_property,))
+    model_config = ConfigDict(extra="forbid", frozen=True, ignored_types=(cached_property,), allow_inf_nan=False)
+
+    def __eq__(self, other: object) -> bool:
+        """Whether both define the same; what was computed of one of them, and kept, does not count."""
+        if type(self) is not type(other):
+            return NotImplemented
+        return all(getattr(self, name) == getattr(other, name) for name in type(self).model_fields)
+
+    def __hash__(self) -> int:
+        return hash((type(self), *(getattr(self, name) for name in type(self).model_fields)))

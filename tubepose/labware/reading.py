@@ -33,7 +33,8 @@ def read_yaml(path: Path, error: type[TubePoseError]) -> dict[str, Any]:
     except yaml.YAMLError as problem:
         raise error(f"{path}: not valid YAML: {' '.join(str(problem).split())}") from None
     if not isinstance(data, dict):
-        raise error(f"{path}: expected a mapping of keys to values, found {type(data).__name__}")
+        found = "nothing: the file is empty" if data is None else f"a {type(data).__name__}"
+        raise error(f"{path}: expected a mapping of keys to values, found {found}")
     return data
 
 
@@ -93,7 +94,7 @@ def read_labware(path: Path) -> Labware:
     """
     data = read_yaml(path, LabwareError)
     kind = data.get("kind")
-    if kind not in _KINDS:
+    if not isinstance(kind, str) or kind not in _KINDS:
         raise LabwareError(f"{path}: expected 'kind: rack', 'kind: tube' or 'kind: cap', found {kind!r}")
     return validate(_KINDS[kind], data, str(path), LabwareError)
 

@@ -64,11 +64,15 @@ class _ImageView:
     def __call__(self, points_m: FloatArray) -> FloatArray:
         if self.intrinsics is None:
             return np.full((*np.shape(points_m)[:-1], 2), np.nan)
-        return np.asarray((self.intrinsics.project(points_m) - self.shift) * self.zoom)
+        return self._drawn(self.intrinsics.project(points_m))
 
     def pixel(self, place: tuple[float, ...]) -> tuple[int, int]:
         """Pixel of the picture that shows a pixel of the image."""
-        return _pixel((np.array(place) - self.shift) * self.zoom)
+        return _pixel(self._drawn(np.array(place)))
+
+    def _drawn(self, places_px: FloatArray) -> FloatArray:
+        """Where the enlarged picture shows pixels (..., 2) of the image, whose middles are whole numbers."""
+        return np.asarray((places_px - self.shift + 0.5) * self.zoom - 0.5)
 
 
 class _TopView:
@@ -91,6 +95,8 @@ class _TopView:
 
     def render(self) -> Picture:
         picture = np.full((*self.size, 3), 30, np.uint8)
+        if len(self.flat) == 0:
+            return picture
         pixels = (self.flat[:, :2] - self.low) * self.zoom
         shade = np.clip(np.interp(self.flat[:, 2], np.percentile(self.flat[:, 2], [2, 98]), [90, 230]), 0, 255)
         for (u, v), value in zip(pixels.astype(int), shade, strict=True):

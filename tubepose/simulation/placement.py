@@ -123,9 +123,12 @@ def lean(rack: RackModel, slot: SlotModel, model: TubeModel, rng: np.random.Gene
     """
     z, r = model.outer_profile_m().T
     inside = z <= rack.depth_m
-    z, r = z[inside], r[inside]
     pivot = model.pivot_height_m
     above = min(rack.depth_m, model.height_m)
+    z, r = z[inside], r[inside]
+    if slot.shape == "round":
+        # A straight wall has no point of its profile at the rack's top, where `room` bounds square openings alone.
+        z, r = np.append(z, above), np.append(r, float(model.body_radius_m(above)))
     room = np.maximum(slot.half_size_m - float(model.body_radius_m(above)) - CLEARANCE_M, 0.0)
     for _ in range(_LEAN_TRIES):
         low = _in_disc(rng, rack.floor_play_mm * 1e-3)
