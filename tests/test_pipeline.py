@@ -304,7 +304,10 @@ def test_profile_without_a_rack_or_types_invents_nothing(seen):
     lost = prepare(frame_of(), detector=Fixed(()))
     assert estimate_tubes(lost, "profile", CONFIG) == ((), ())
     bare = prepare_scene(seen.frame, RACK, (), Fixed(()), CONFIG, T_camera_rack=T_CAMERA_RACK, methods=("profile",))
-    assert estimate_tubes(bare, "profile", CONFIG) == ((), ())
+    estimates, _ = estimate_tubes(bare, "profile", CONFIG)
+    assert {(entry.target.tube, entry.pose.status, entry.T_camera_tube) for entry in estimates} == {
+        (None, TubeStatus.REJECTED, None)
+    }
 
 
 def test_a_tube_across_the_rack_is_no_target_of_profile_but_a_row_with_a_reason():
@@ -318,8 +321,16 @@ def test_a_tube_across_the_rack_is_no_target_of_profile_but_a_row_with_a_reason(
     assert estimate.target.reason == estimate.pose.reason
     assert estimate.pose.reason.startswith("lies across the rack: ")
     assert time.instance == ""
-    rows = slot_rows({}, "profile", found, (estimate,))
-    assert not any(row["occupied"] for row in rows)
+    rows = {row["slot"]: row for row in slot_rows({}, "profile", found, (estimate,))}
+    # Nothing can be put into the slots under it.
+    covered = {slot.name for slot in RACK.all_slots if np.all(np.abs(slot.center_m) < (38e-3, 4e-3))}
+    beside = {slot.name for slot in RACK.all_slots if np.any(np.abs(slot.center_m) > (52e-3, 14e-3))}
+    assert covered
+    for name, row in rows.items():
+        assert row["occupied"] or name not in covered
+        assert not (row["occupied"] and name in beside)
+        if row["occupied"]:
+            assert (row["status"], row["reason"]) == ("rejected", estimate.pose.reason)
 
 
 def test_a_slot_with_two_finds_has_one_row_and_it_is_the_first(seen):

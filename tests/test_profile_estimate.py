@@ -253,15 +253,21 @@ def test_an_empty_rack_has_no_tubes(frame):
     assert ps.fit(empty, VIEW, RACK, TUBES) == ()
 
 
-def test_no_types_give_no_tubes(frame):
-    assert ps.fit(frame, VIEW, RACK, ()) == ()
+def test_without_types_what_stands_there_is_told_of_without_a_pose(frame, found):
+    alone = ps.fit(frame, VIEW, RACK, ())
+    assert alone
+    for entry in alone:
+        assert (entry.tube, entry.pose.status, entry.pose.T_rack_tube) == (None, TubeStatus.REJECTED, None)
+        assert entry.slot is None or entry.pose.reason.endswith("no tube model given (--tubes)")
+    assert {entry.slot for entry in alone} - {None} <= {entry.slot for entry in found}
 
 
 @pytest.mark.parametrize("organised", [True, False])
 def test_nothing_but_missing_values(frame, organised):
     nothing = np.full_like(frame.cloud_m, np.nan)
     if organised:
-        assert ps.fit(clouded(frame, nothing), VIEW, RACK, TUBES) == ()
+        blind = dataclasses.replace(clouded(frame, nothing), image=None)
+        assert ps.fit(blind, VIEW, RACK, TUBES) == ()
     else:
         assert ps.fit(scenes.unorganised(nothing.reshape(-1, 3)), VIEW, RACK, TUBES) == ()
 

@@ -10,6 +10,7 @@ from tubepose.profile import fit_profiles
 from tubepose.profile.faint_rims import find_faint_rims
 from tubepose.profile.measure import blocked_sectors
 from tubepose.profile.outline import SECTORS
+from tubepose.profile.standing import Standing
 from tubepose.transforms import invert_transform, transform_points
 
 CONFIG = ProfileConfig()
@@ -22,10 +23,14 @@ def free(place_m):
     return np.zeros((len(place_m), SECTORS), bool)
 
 
-def look(image, centers_m=CENTERS_M, blocked_at=free, config=CONFIG):
+NOTHING = Standing(np.empty((0, 3)), invert_transform(VIEW)[:3, 3])
+
+
+def look(image, centers_m=CENTERS_M, blocked_at=free, config=CONFIG, standing=NOTHING):
     return find_faint_rims(
-        frame_of(image), CAMERA, VIEW, centers_m, REACH_M, LEVEL_M, np.array([INNER_M, OUTER_M]), blocked_at, config
-    )
+        frame_of(image), CAMERA, VIEW, centers_m, REACH_M, LEVEL_M, np.array([INNER_M, OUTER_M]), blocked_at, standing,
+        config,
+    )  # fmt: skip
 
 
 @pytest.mark.parametrize("shift_mm", [(0.0, 0.0), (3.5, -1.0), (-2.0, 3.0)])
@@ -92,6 +97,34 @@ def test_a_rim_that_other_tops_are_near_to_on_too_many_sides_is_not_told_of():
 
     assert beside(1) > 0.75
     assert beside(6) == -np.inf
+
+
+def ring_of_points(height_m, share=1.0, scatter_m=2e-4, count=600):
+    """Points that are seen on the rim of a tube in C5, at any height on their lines of sight."""
+    rng = np.random.default_rng(4)
+    angle, rho = rng.uniform(0, 2 * np.pi * share, count), rng.uniform(INNER_M, OUTER_M, count)
+    at = np.column_stack(
+        [CENTERS_M[1] + rho[:, None] * np.column_stack([np.cos(angle), np.sin(angle)]), np.full(count, LEVEL_M)]
+    )
+    camera = NOTHING.camera_m
+    heights = height_m + rng.normal(0, scatter_m, count)
+    along = (heights - camera[2]) / (LEVEL_M - camera[2])
+    return Standing(camera + (at - camera) * along[:, None], camera)
+
+
+@pytest.mark.parametrize(
+    ("standing", "told"),
+    [
+        (ring_of_points(LEVEL_M + 7e-3), False),  # the rim of a taller tube
+        (ring_of_points(LEVEL_M - 7e-3), False),  # of a lower one
+        (ring_of_points(LEVEL_M - 1e-3), True),  # light from below the surface of the rim itself
+        (ring_of_points(LEVEL_M - 20e-3, scatter_m=8e-3), True),  # what lies behind clear plastic
+        (ring_of_points(LEVEL_M - 7e-3, share=0.4), True),  # something behind one side of it
+    ],
+)
+def test_a_ring_of_points_at_another_height_is_the_rim_of_something_else(standing, told):
+    contrast = look(drawn(VIEW, CENTERS_M[1]), standing=standing).contrast[1]
+    assert contrast > 0.75 if told else contrast == -np.inf
 
 
 def test_beyond_the_picture_there_is_nothing():

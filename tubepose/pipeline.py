@@ -4,11 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from typing import TypeGuard
-
-import numpy as np
-from numpy.typing import NDArray
 
 from tubepose.baselines import fit_global_icp, fit_slot_icp, fit_upright
 from tubepose.capture.frame import CameraIntrinsics, RgbdFrame
@@ -22,9 +18,10 @@ from tubepose.preprocessing import remove_outliers
 from tubepose.profile import ProfileTube, fit_profiles
 from tubepose.rack import RackPose, RackStatus, register_rack
 from tubepose.rivals import fit_gicp, fit_kiss_matcher
-from tubepose.slots import SlotAssignment, assign_slots, crop_to_slot, identify_tube
+from tubepose.scene import Scene, TubeEstimate, TubeTarget
 from tubepose.stage_times import Clock, StageTime
-from tubepose.transforms import FloatArray, invert_transform, transform_points
+from tubepose.targets import allowed_types, boxes_alone, find_targets
+from tubepose.transforms import FloatArray
 from tubepose.tube import TubeMethod, TubePose, TubeStatus, fit_tube
 
 TUBE_METHODS: Mapping[str, TubeMethod] = {
@@ -42,71 +39,6 @@ METHODS = (DEFAULT_METHOD, *TUBE_METHODS)
 RACK_MARGIN = 0.10
 """A rack is looked for in a little more than its box: a box that is drawn too tight cuts its edges off."""
 STOCHASTIC = frozenset({"global-icp", "kiss-matcher"})
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class TubeTarget:
-    """A detected tube, ready for any method.
-
-    Attributes:
-        detection: Index of the detection; None for a tube that `profile` found itself.
-        slot: Name of the slot, or None.
-        tube: The tube's model, or None where its type is unknown.
-        share: Share of its projected hull in the slot's opening; of `profile`, how much of its top was seen.
-        reason: Why no method can be asked; empty otherwise.
-        points_m: Points, rack frame, shape (N, 3), metres.
-    """
-
-    detection: int | None
-    slot: str | None
-    tube: TubeModel | None
-    share: float
-    reason: str
-    points_m: FloatArray
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Scene:
-    """What all methods share of one frame: boxes, rack, slots.
-
-    Attributes:
-        frame: The frame.
-        rack: The rack's model.
-        tubes: The kinds of tube that can stand in it.
-        intrinsics: Recorded or, for an organised cloud, estimated from it; None where there are none.
-        detections: All boxes.
-        rack_pose: The rack's pose, or why there is none.
-        targets: Every detected tube (empty without a rack's pose).
-        times: Duration of the shared stages.
-    """
-
-    frame: RgbdFrame
-    rack: RackModel
-    tubes: tuple[TubeModel, ...]
-    intrinsics: CameraIntrinsics | None
-    detections: tuple[Detection, ...]
-    rack_pose: RackPose
-    targets: tuple[TubeTarget, ...]
-    times: tuple[StageTime, ...]
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class TubeEstimate:
-    """One method's answer for one detected tube.
-
-    Attributes:
-        method: Name in `METHODS`.
-        seed: Seed of a stochastic method, else None.
-        target: What the method was asked.
-        pose: Its answer in the rack frame.
-        T_camera_tube: The same in the camera frame, shape (4, 4), metres; None without a pose.
-    """
-
-    method: str
-    seed: int | None
-    target: TubeTarget
-    pose: TubePose
-    T_camera_tube: FloatArray | None
 
 
 def prepare_scene(
@@ -159,7 +91,7 @@ def prepare_scene(
             with clock.stage("detect"):
                 detections = detector.checked(frame, rack_pose.T_camera_rack, detections)
         with clock.stage("slots"):
-            targets = _targets(frame, rack, tubes, detections, rack_pose.T_camera_rack, config)
+            targets = find_targets(frame, rack, tubes, detections, rack_pose.T_camera_rack, config)
     return Scene(frame, rack, tuple(tubes), intrinsics, detections, rack_pose, targets, clock.shared())
 
 
@@ -210,7 +142,9 @@ def _profile_estimates(scene: Scene, config: Config) -> tuple[tuple[TubeEstimate
         allowed=allowed_types(scene),
     )
     share_ms = (time.perf_counter_ns() - start) / 1e6 / max(len(found), 1)
-    estimates = tuple(_estimate(scene, DEFAULT_METHOD, None, _profile_target(tube), tube.pose) for tube in found)
+    targets = [(_profile_target(tube), tube.pose) for tube in found]
+    targets += [(other, TubePose(TubeStatus.REJECTED, other.reason)) for other in boxes_alone(scene, found, config)]
+    estimates = tuple(_estimate(scene, DEFAULT_METHOD, None, *target) for target in targets)
     times = tuple(StageTime("tube", DEFAULT_METHOD, tube.slot or "", None, share_ms) for tube in found)
     return estimates, times
 
@@ -218,31 +152,6 @@ def _profile_estimates(scene: Scene, config: Config) -> tuple[tuple[TubeEstimate
 def _profile_target(tube: ProfileTube) -> TubeTarget:
     reason = "" if tube.tube is not None else tube.pose.reason
     return TubeTarget(None, tube.slot, tube.tube, tube.support, reason, tube.points_m)
-
-
-def allowed_types(scene: Scene) -> NDArray[np.bool_] | None:
-    """Which type may stand in which slot, shape (K, S), as far as a detector's classes say; None without a word.
-
-    A box of a known class speaks for the slot whose tube's top, upright, is seen nearest to the box's middle.
-    """
-    T_camera_rack = scene.rack_pose.T_camera_rack
-    named = {word: k for k, tube in enumerate(scene.tubes) for word in (tube.name, *tube.classes)}
-    boxes = [box for box in scene.detections if box.class_name in named and np.isfinite(box.box_xyxy_px).all()]
-    if not boxes or scene.intrinsics is None or T_camera_rack is None:
-        return None
-    may = np.ones((len(scene.tubes), len(scene.rack.all_slots)), bool)
-    for box in boxes:
-        k = named[box.class_name]
-        top_m = np.column_stack(
-            [scene.rack.slot_centers_m, np.full(may.shape[1], scene.rack.floor_m + scene.tubes[k].height_m)]
-        )
-        pixels = scene.intrinsics.project(transform_points(T_camera_rack, top_m))
-        left, top, right, bottom = box.box_xyxy_px
-        distance = np.hypot(*(pixels - np.array([left + right, top + bottom]) / 2).T)
-        slot = int(np.argmin(distance))
-        if distance[slot] < max(right - left, bottom - top):
-            may[:, slot] = np.arange(len(scene.tubes)) == k
-    return may
 
 
 def best_rack(detections: Sequence[Detection]) -> Detection | None:
@@ -269,39 +178,6 @@ def _may_be_helped(detector: Detector, detections: Sequence[Detection]) -> TypeG
     """Whether the cloud's geometry, which may find the network's rack, has not been asked yet."""
     asked = any(detection.is_rack and detection.source == "geometric" for detection in detections)
     return isinstance(detector, AssistedDetector) and not asked
-
-
-def _targets(
-    frame: RgbdFrame,
-    rack: RackModel,
-    tubes: Sequence[TubeModel],
-    detections: Sequence[Detection],
-    T_camera_rack: FloatArray,
-    config: Config,
-) -> tuple[TubeTarget, ...]:
-    T_rack_camera = invert_transform(T_camera_rack)
-    indices = [i for i, detection in enumerate(detections) if not detection.is_rack]
-    clouds = [transform_points(T_rack_camera, frame.points_m[rows_in_box(frame, detections[i])]) for i in indices]
-    assigned = assign_slots(clouds, rack, config.slots)
-    return tuple(
-        _target(index, detections[index].class_name, entry, rack, tubes, config)
-        for index, entry in zip(indices, assigned, strict=True)
-    )
-
-
-def _target(
-    index: int, class_name: str, entry: SlotAssignment, rack: RackModel, tubes: Sequence[TubeModel], config: Config
-) -> TubeTarget:
-    points_m = entry.points_m
-    if entry.slot is None:
-        return TubeTarget(index, None, None, entry.share, entry.reason, points_m)
-    if not tubes:
-        return TubeTarget(index, entry.slot, None, entry.share, "no tube model given (--tubes)", points_m)
-    slot = rack.slot(entry.slot)
-    tube, reason = identify_tube(class_name, points_m, tubes, rack, config.slots)
-    if tube is not None:
-        points_m = crop_to_slot(points_m, slot, tube, rack, config.slots)
-    return TubeTarget(index, entry.slot, tube, entry.share, reason, points_m)
 
 
 __all__ = [

@@ -10,6 +10,7 @@ import pandas as pd
 
 from tubepose.pipeline import Scene, StageTime, TubeEstimate, best_rack
 from tubepose.pose_errors import COVARIANCE_COLUMNS, upper_half
+from tubepose.slots import covered_slots
 from tubepose.transforms import FloatArray, quaternion_wxyz, tilt_rad
 
 Row = dict[str, Any]
@@ -96,11 +97,20 @@ def rack_row(scene: Scene) -> Row:
 
 
 def slot_rows(keys: Row, method: str, scene: Scene, estimates: Sequence[TubeEstimate]) -> list[Row]:
-    """Rows of slots.csv, one per slot of the rack; none without the rack's pose."""
+    """Rows of slots.csv, one per slot of the rack; none without the rack's pose.
+
+    What stands in no slot, or is no known tube, covers slots all the same: they are not empty.
+    """
     if scene.rack_pose.T_camera_rack is None:
         return []
     # The first of a slot counts: what was found in it besides comes after it.
-    held = {estimate.target.slot: estimate for estimate in reversed(estimates) if estimate.target.slot is not None}
+    held = {
+        name: estimate
+        for estimate in estimates
+        if estimate.target.slot is None
+        for name in covered_slots(estimate.target.points_m, scene.rack)
+    }
+    held |= {estimate.target.slot: estimate for estimate in reversed(estimates) if estimate.target.slot is not None}
     rows = []
     for slot in scene.rack.all_slots:
         estimate = held.get(slot.name)

@@ -15,6 +15,11 @@ from tubepose.detection.model import CAPPED_CLASS, OPEN_CLASS, TUBE_CLASS, visib
 from tubepose.labware import RackModel, SlotModel, TubeModel
 from tubepose.transforms import FloatArray
 
+COVER_CELL_M = 1.5e-3
+CORE_PITCHES = 0.25
+CORE_SHARE = 0.6
+"""A slot's middle, a disc of so many pitches, is covered where this share of its cells has points."""
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SlotAssignment:
@@ -104,6 +109,16 @@ def assign_slots(tubes_m: Sequence[FloatArray], rack: RackModel, config: SlotCon
         else:
             found.append(SlotAssignment(tube, names[chosen], float(shares[tube, chosen]), "", points))
     return tuple(found)
+
+
+def covered_slots(points_m: FloatArray, rack: RackModel) -> frozenset[str]:
+    """Slots whose middle is covered by points (N, 3), rack frame, as seen from above: nothing can be put in there."""
+    cells = np.unique(np.floor(points_m[:, :2] / COVER_CELL_M), axis=0) * COVER_CELL_M + COVER_CELL_M / 2
+    core_m = CORE_PITCHES * rack.pitches_m
+    apart = np.linalg.norm(rack.slot_centers_m[:, None] - cells[None], axis=2)
+    filled_m2 = (apart < core_m[:, None]).sum(axis=1) * COVER_CELL_M**2
+    covered = filled_m2 > CORE_SHARE * np.pi * core_m**2
+    return frozenset(slot.name for slot, is_covered in zip(rack.all_slots, covered, strict=True) if is_covered)
 
 
 def lean_reach_m(z_m: FloatArray, slot: SlotModel, tube: TubeModel, rack: RackModel) -> FloatArray:

@@ -67,10 +67,12 @@ def fit_profiles(
         allowed: Which type may stand in which slot, shape (K, S), where a detector says; all by default.
 
     Returns:
-        Tubes by slot, then what is left over.
+        Tubes by slot, then what is left over; without types, all that stands there is.
     """
     if not tubes:
-        return ()
+        standing = _all_standing(frame, intrinsics, T_camera_rack, rack, config)
+        unknown = find_leftovers(standing, np.full(len(standing.points_m), -1), (), rack, ())
+        return tuple(_no_tube(left, standing, rack) for left in unknown)
     if rack.floor_tolerance_mm > SETTLED_MM:
         rack = settle_floor(_all_standing(frame, intrinsics, T_camera_rack, rack, config), rack, tubes, config.profile)
     measured = measure_tops(frame, intrinsics, T_camera_rack, rack, tubes, config, allowed)
@@ -88,7 +90,7 @@ def fit_profiles(
         if crowd and pose.status is TubeStatus.OK:
             pose = _rejected(pose, f"two tubes in one slot: {crowd}")
         found.append(ProfileTube(slot.name, tube, float(measured.tops.support[i]), clouds[i], pose))
-    return (*found, *(_no_tube(left, measured, rack) for left in leftovers))
+    return (*found, *(_no_tube(left, measured.points, rack) for left in leftovers))
 
 
 def _clouds(measured: Measured, count: int) -> list[FloatArray]:
@@ -243,9 +245,9 @@ def _rejected(pose: TubePose, reason: str) -> TubePose:
     )
 
 
-def _no_tube(left: Leftover, measured: Measured, rack: RackModel) -> ProfileTube:
+def _no_tube(left: Leftover, standing: Standing, rack: RackModel) -> ProfileTube:
     """What is left over, as a tube without a pose."""
-    points_m = measured.points.points_m[left.rows]
+    points_m = standing.points_m[left.rows]
     slot = rack.all_slots[left.slot].name if left.slot is not None else None
     return ProfileTube(
         slot, None, float("nan"), points_m, TubePose(TubeStatus.REJECTED, left.reason, n_points=len(points_m))

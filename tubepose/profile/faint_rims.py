@@ -18,9 +18,10 @@ from numpy.typing import NDArray
 
 from tubepose.capture.frame import CameraIntrinsics, RgbdFrame
 from tubepose.config import ProfileConfig
-from tubepose.profile.fit_kernels import ring_votes
-from tubepose.profile.outline import Circles, unknown_circles
+from tubepose.profile.fit_kernels import ring_heights, ring_votes
+from tubepose.profile.outline import SECTORS, Circles, unknown_circles
 from tubepose.profile.rims import brightness, fit_rims, ring_contrast
+from tubepose.profile.standing import Standing
 from tubepose.transforms import FloatArray
 
 CELL_M = 0.4e-3
@@ -31,6 +32,9 @@ LEAST_FREE = 0.75
 """Least share of a circle that no other top is near to."""
 EDGE_M = 20e-3
 """How far beyond the middles of slots the image is laid out."""
+BIN_M = 1e-3
+ONE_HEIGHT_SHARE, ALL_AROUND = 0.6, 0.6
+"""Points on a ring are at one height where three bins hold this share of them, in this share of its sectors."""
 LEAST_GRAY = 0.02
 """Differences under this share of the picture's range are noise."""
 
@@ -59,6 +63,7 @@ def find_faint_rims(
     level_m: float,
     radii_m: FloatArray,
     blocked_at: Callable[[FloatArray], NDArray[np.bool_]],
+    standing: Standing,
     config: ProfileConfig,
 ) -> FaintRims:
     """Look for a rim in each of some slots.
@@ -72,6 +77,7 @@ def find_faint_rims(
         level_m: Height of the rims above the rack's base.
         radii_m: Inner and outer radius of the rims, shape (2,).
         blocked_at: From middles of rims, shape (N, 2), to the sectors that other tops are too near to, (N, SECTORS).
+        standing: Points above the rack's top: a ring of them at another height is a rim of something else.
         config: Limits, and noise of outlines.
     """
     middle, votes = _likeliest(frame, intrinsics, T_camera_rack, center_m, reach_m, level_m, radii_m)
@@ -85,8 +91,33 @@ def find_faint_rims(
     place = middle[at] + np.nan_to_num(found.offset_m)
     blocked = blocked_at(place)
     seen = np.isfinite(found.offset_m[:, 0]) & ((~blocked).mean(axis=1) >= LEAST_FREE)
+    seen &= ~_at_another_height(standing, place, level_m, radii_m, config)
     contrast[at] = np.where(seen, ring_contrast(*view, place, *size, blocked), -np.inf)
     return FaintRims(middle, circles.put(at, found), contrast)
+
+
+def _at_another_height(
+    standing: Standing, center_m: FloatArray, level_m: float, radii_m: FloatArray, config: ProfileConfig
+) -> NDArray[np.bool_]:
+    """Where most points that are seen on a ring, all around it, lie at one height that is not a rim's: shape (N,).
+
+    Clear plastic leaves hardly a point there, or some at all heights.
+    """
+    z = standing.points_m[:, 2]
+    if len(z) == 0:
+        return np.zeros(len(center_m), bool)
+    low = float(z.min())
+    bins = int((float(z.max()) - low) / BIN_M) + 1
+    counts = ring_heights(
+        standing.points_m, standing.camera_m, level_m, center_m, radii_m[0], radii_m[1], low, BIN_M, bins, SECTORS
+    )
+    window = sum(np.roll(counts, shift, axis=1) for shift in (-1, 0, 1))  # three bins; low and high ends are far apart
+    total, best = counts.sum(axis=(1, 2)), window.sum(axis=2).argmax(axis=1)
+    most = window[np.arange(len(center_m)), best]
+    above = low + (best + 0.5) * BIN_M - level_m
+    expected = (above > -config.rim_depth_m) & (above < config.top_band_m)
+    one_height = (most.sum(axis=1) >= ONE_HEIGHT_SHARE * np.maximum(total, 1)) & (total > 0)
+    return np.asarray(one_height & ((most > 0).mean(axis=1) >= ALL_AROUND) & ~expected)
 
 
 def _likeliest(

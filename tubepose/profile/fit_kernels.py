@@ -223,3 +223,23 @@ def ring_votes(picture, cells, shifts, ring, inside, outside, least):
             if total > votes[s] * len(ring):
                 votes[s], best[s] = total / len(ring), m
     return votes, best
+
+
+@compiled
+def ring_heights(points_m, camera_m, level_m, centers_m, inner_m, outer_m, low_m, bin_m, bins, sectors):
+    """Points (T, B, sectors) that are seen on rings of a level, by height, in bins from `low_m` on, and direction."""
+    counts = np.zeros((len(centers_m), bins, sectors), np.intp)
+    for k in range(len(points_m)):
+        height = int((points_m[k, 2] - low_m) / bin_m)
+        if not 0 <= height < bins:
+            continue
+        along = (level_m - camera_m[2]) / (points_m[k, 2] - camera_m[2])
+        x = camera_m[0] + (points_m[k, 0] - camera_m[0]) * along
+        y = camera_m[1] + (points_m[k, 1] - camera_m[1]) * along
+        for t in range(len(centers_m)):
+            right, ahead = x - centers_m[t, 0], y - centers_m[t, 1]
+            rho2 = right * right + ahead * ahead
+            if inner_m * inner_m < rho2 < outer_m * outer_m:
+                sector = int((math.atan2(ahead, right) + math.pi) / (2.0 * math.pi) * sectors) % sectors
+                counts[t, height, sector] += 1
+    return counts

@@ -106,6 +106,5 @@ def _judge(
             return None
         return Leftover(slot, f"a second top in slot {rack.all_slots[slot].name}, {height_m * 1e3:.1f} mm high", rows)
     heights = ", ".join(f"{tube.name} {tube.height_mm:g}" for tube in tubes)
-    return Leftover(
-        slot, f"unknown type: {height_m * 1e3:.1f} mm high, expected (mm): {heights}; or it stands on something", rows
-    )
+    expected = f"expected (mm): {heights}; or it stands on something" if tubes else "no tube model given (--tubes)"
+    return Leftover(slot, f"unknown type: {height_m * 1e3:.1f} mm high, {expected}", rows)

@@ -100,7 +100,7 @@ def measure_tops(
     tops, rims = tops.take(kept), rims.take(kept)
     if frame.image is not None and frame.organised and intrinsics is not None:
         tops, rims = _with_faint_rims(
-            frame, intrinsics, T_camera_rack, tops, rims, rack, tubes, config.profile, allowed
+            frame, intrinsics, T_camera_rack, tops, rims, standing, rack, tubes, config.profile, allowed
         )
     shape = _shapes(tops, tubes, rack)
     label = label_points(standing, tops.center_m, shape.radius_m)
@@ -153,6 +153,7 @@ def _with_faint_rims(
     T_camera_rack: FloatArray,
     tops: Tops,
     rims: Circles,
+    standing: Standing,
     rack: RackModel,
     tubes: Sequence[TubeModel],
     config: ProfileConfig,
@@ -171,7 +172,7 @@ def _with_faint_rims(
         seen.append(
             find_faint_rims(
                 frame, intrinsics, T_camera_rack, rack.slot_centers_m[free], reach_m, top_level_m(tube, rack), radii,
-                partial(_blocked_by, *known, float(radii[1])), config,
+                partial(_blocked_by, *known, float(radii[1])), standing, config,
             )
         )  # fmt: skip
     contrast = np.stack([one.contrast for one in seen])

@@ -1,0 +1,78 @@
+"""What all methods share of one frame, and what each of them answers."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from tubepose.capture.frame import CameraIntrinsics, RgbdFrame
+from tubepose.detection import Detection
+from tubepose.labware import RackModel, TubeModel
+from tubepose.rack import RackPose
+from tubepose.stage_times import StageTime
+from tubepose.transforms import FloatArray
+from tubepose.tube import TubePose
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TubeTarget:
+    """A detected tube, ready for any method.
+
+    Attributes:
+        detection: Index of the detection; None for a tube that `profile` found itself.
+        slot: Name of the slot, or None.
+        tube: The tube's model, or None where its type is unknown.
+        share: Share of its projected hull in the slot's opening; of `profile`, how much of its top was seen.
+        reason: Why no method can be asked; empty otherwise.
+        points_m: Points, rack frame, shape (N, 3), metres.
+    """
+
+    detection: int | None
+    slot: str | None
+    tube: TubeModel | None
+    share: float
+    reason: str
+    points_m: FloatArray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Scene:
+    """What all methods share of one frame: boxes, rack, slots.
+
+    Attributes:
+        frame: The frame.
+        rack: The rack's model.
+        tubes: The kinds of tube that can stand in it.
+        intrinsics: Recorded or, for an organised cloud, estimated from it; None where there are none.
+        detections: All boxes.
+        rack_pose: The rack's pose, or why there is none.
+        targets: Every detected tube (empty without a rack's pose).
+        times: Duration of the shared stages.
+    """
+
+    frame: RgbdFrame
+    rack: RackModel
+    tubes: tuple[TubeModel, ...]
+    intrinsics: CameraIntrinsics | None
+    detections: tuple[Detection, ...]
+    rack_pose: RackPose
+    targets: tuple[TubeTarget, ...]
+    times: tuple[StageTime, ...]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TubeEstimate:
+    """One method's answer for one detected tube.
+
+    Attributes:
+        method: Name in `METHODS`.
+        seed: Seed of a stochastic method, else None.
+        target: What the method was asked.
+        pose: Its answer in the rack frame.
+        T_camera_tube: The same in the camera frame, shape (4, 4), metres; None without a pose.
+    """
+
+    method: str
+    seed: int | None
+    target: TubeTarget
+    pose: TubePose
+    T_camera_tube: FloatArray | None

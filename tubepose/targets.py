@@ -1,0 +1,121 @@
+"""From boxes to tubes: the slot and the type of every detection, and what a detector's words say of slots."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tubepose.capture.frame import RgbdFrame
+from tubepose.config import Config
+from tubepose.detection import Detection, rows_in_box
+from tubepose.detection.assisted import SURE_SCORE
+from tubepose.labware import RackModel, TubeModel
+from tubepose.profile import ProfileTube
+from tubepose.scene import Scene, TubeTarget
+from tubepose.slots import SlotAssignment, assign_slots, crop_to_slot, identify_tube
+from tubepose.transforms import FloatArray, invert_transform, transform_points
+
+
+def find_targets(
+    frame: RgbdFrame,
+    rack: RackModel,
+    tubes: Sequence[TubeModel],
+    detections: Sequence[Detection],
+    T_camera_rack: FloatArray,
+    config: Config,
+) -> tuple[TubeTarget, ...]:
+    """Every detected tube with its slot, type and points, in the order of the detections."""
+    indices = [i for i, detection in enumerate(detections) if not detection.is_rack]
+    assigned = _assigned(frame, rack, detections, indices, T_camera_rack, config)
+    return tuple(
+        _target(index, detections[index].class_name, entry, rack, tubes, config)
+        for index, entry in zip(indices, assigned, strict=True)
+    )
+
+
+def _target(
+    index: int, class_name: str, entry: SlotAssignment, rack: RackModel, tubes: Sequence[TubeModel], config: Config
+) -> TubeTarget:
+    points_m = entry.points_m
+    if entry.slot is None:
+        return TubeTarget(index, None, None, entry.share, entry.reason, points_m)
+    if not tubes:
+        return TubeTarget(index, entry.slot, None, entry.share, "no tube model given (--tubes)", points_m)
+    slot = rack.slot(entry.slot)
+    tube, reason = identify_tube(class_name, points_m, tubes, rack, config.slots)
+    if tube is not None:
+        points_m = crop_to_slot(points_m, slot, tube, rack, config.slots)
+    return TubeTarget(index, entry.slot, tube, entry.share, reason, points_m)
+
+
+def boxes_alone(scene: Scene, found: Sequence[ProfileTube], config: Config) -> list[TubeTarget]:
+    """Slots in which a detector is sure of a tube, and `profile` has found nothing: they are not empty."""
+    T_camera_rack = scene.rack_pose.T_camera_rack
+    if T_camera_rack is None or scene.intrinsics is None:
+        return []
+    posed = [(tube.pose.T_rack_tube, tube.tube.height_m) for tube in found if tube.tube is not None]
+    tops_m = np.array([T[:3, 3] + height_m * T[:3, 2] for T, height_m in posed if T is not None]).reshape(-1, 3)
+    pixels = scene.intrinsics.project(transform_points(T_camera_rack, tops_m))
+    rest = [
+        k
+        for k, box in enumerate(scene.detections)
+        if not box.is_rack and box.score >= SURE_SCORE and not _holds_any(box, pixels)
+    ]
+    taken = {tube.slot for tube in found}
+    reason = "a tube is detected here, but none of the given types was found in the slot"
+    return [
+        TubeTarget(k, entry.slot, None, entry.share, reason, entry.points_m)
+        for k, entry in zip(
+            rest, _assigned(scene.frame, scene.rack, scene.detections, rest, T_camera_rack, config), strict=True
+        )
+        if entry.slot is not None and entry.slot not in taken
+    ]
+
+
+def _holds_any(box: Detection, pixels: FloatArray) -> bool:
+    """Whether a box holds one of some pixels (N, 2); one without edges says nothing, and counts as if it did."""
+    left, top, right, bottom = box.box_xyxy_px
+    if not np.isfinite(box.box_xyxy_px).all():
+        return True
+    return bool(((pixels >= (left, top)) & (pixels <= (right, bottom))).all(axis=1).any())
+
+
+def _assigned(
+    frame: RgbdFrame,
+    rack: RackModel,
+    detections: Sequence[Detection],
+    chosen: Sequence[int],
+    T_camera_rack: FloatArray,
+    config: Config,
+) -> tuple[SlotAssignment, ...]:
+    """Slots of some of the detections."""
+    T_rack_camera = invert_transform(T_camera_rack)
+    clouds = [transform_points(T_rack_camera, frame.points_m[rows_in_box(frame, detections[k])]) for k in chosen]
+    return assign_slots(clouds, rack, config.slots)
+
+
+def allowed_types(scene: Scene) -> NDArray[np.bool_] | None:
+    """Which type may stand in which slot, shape (K, S), as far as a detector's classes say; None without a word.
+
+    A box of a known class speaks for the slot whose tube's top, upright, is seen nearest to the box's middle.
+    """
+    T_camera_rack = scene.rack_pose.T_camera_rack
+    named = {word: k for k, tube in enumerate(scene.tubes) for word in (tube.name, *tube.classes)}
+    boxes = [box for box in scene.detections if box.class_name in named and np.isfinite(box.box_xyxy_px).all()]
+    if not boxes or scene.intrinsics is None or T_camera_rack is None:
+        return None
+    may = np.ones((len(scene.tubes), len(scene.rack.all_slots)), bool)
+    for box in boxes:
+        k = named[box.class_name]
+        top_m = np.column_stack(
+            [scene.rack.slot_centers_m, np.full(may.shape[1], scene.rack.floor_m + scene.tubes[k].height_m)]
+        )
+        pixels = scene.intrinsics.project(transform_points(T_camera_rack, top_m))
+        left, top, right, bottom = box.box_xyxy_px
+        distance = np.hypot(*(pixels - np.array([left + right, top + bottom]) / 2).T)
+        slot = int(np.argmin(distance))
+        if distance[slot] < max(right - left, bottom - top):
+            may[:, slot] = np.arange(len(scene.tubes)) == k
+    return may
