@@ -101,11 +101,8 @@ def estimate(
         problems=problems, detector=detector,
     )  # fmt: skip
     for row in tables.racks:
-        turn = (
-            ", turn ambiguous by 180 degrees (slot names may be swapped; --hint SLOT@U,V settles it)"
-            if row["ambiguous"]
-            else ""
-        )
+        settle = row["hint_note"] or "--hint SLOT@U,V settles it"
+        turn = f", turn ambiguous by 180 degrees (slot names may be swapped; {settle})" if row["ambiguous"] else ""
         if row["status"] == "ok":
             rack_words = f"ok, inlier rmse {row['inlier_rmse_m'] * 1e3:.2f} mm{turn}"
         else:

@@ -16,6 +16,8 @@ if TYPE_CHECKING:
     from tubepose_cli.racks import RackChoice
 
 SAMPLE = "sample"
+DETECTORS = {"geometric": (), "yolo": ("--model", "--classes", "--layout"), "recorded": ("--boxes", "--classes")}
+"""Sources of boxes by name, and the options that each of them reads."""
 
 
 def sample_session() -> Path:
@@ -105,6 +107,13 @@ def capture_jobs(
     from tubepose_cli.racks import UNKNOWN, find_racks
 
     if path.name == SESSION_FILE or (path.is_dir() and is_session(path)):
+        given = {"--unit": unit, "--hint": hint} | {f"--{kind}-topic": name for kind, name in (topics or {}).items()}
+        idle = [option for option, value in given.items() if value is not None]
+        if idle:
+            raise ConfigError(
+                f"{path}: {', '.join(idle)} given, but a session says that itself, trial by trial; "
+                "leave it out, or give the captures one by one"
+            )
         known, problems = session_jobs(load_session(path), fail_fast=fail_fast)
         jobs = [replace(job, rack=choice.rack or job.rack, tubes=tubes or job.tubes) for job in known]
         found, unfound = find_racks(jobs, choice, config, fail_fast=fail_fast, say=say) if choice.open else (jobs, [])
@@ -177,6 +186,10 @@ def make_detector(
     """Source of boxes by name; the files are read once, before the first capture."""
     from tubepose.errors import ConfigError
 
+    given = {"--model": model, "--boxes": boxes, "--classes": classes, "--layout": layout}
+    idle = [option for option, value in given.items() if value is not None and option not in DETECTORS.get(name, given)]
+    if idle:
+        raise ConfigError(f"{', '.join(idle)} given, but --detector {name} has no use for it; leave it out")
     if name == "geometric":
         from tubepose.detection.geometric import GeometricDetector
 
@@ -198,4 +211,4 @@ def make_detector(
 
         recorded = RecordedDetector(boxes, classes=classes)
         return lambda _rack, _tubes: recorded
-    raise ConfigError(unknown_name("detector", name, ("geometric", "yolo", "recorded")))
+    raise ConfigError(unknown_name("detector", name, DETECTORS))

@@ -716,3 +716,35 @@ def test_without_tubes_it_is_said_that_only_the_rack_is_estimated(small_session:
     ended = tubepose("estimate", original(small_session), "--rack", SMALL_RACK, "--out", tmp_path / "out")
     assert ended.code == 0
     assert "only the rack and its slots are estimated" in ended.err
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        (("--hint", "A1@10,10"), "--hint given, but a session says that itself"),
+        (("--unit", "mm", "--depth-topic", "/d"), "--unit, --depth-topic given, but a session says that itself"),
+    ],
+)
+def test_an_option_that_a_session_decides_is_refused(
+    options: tuple[str, ...], words: str, small_session: Path, tmp_path: Path
+) -> None:
+    ended = tubepose("estimate", small_session, *options, "--out", tmp_path / "out")
+    assert ended.code == 1
+    assert any(words in line for line in ended.errors)
+
+
+@pytest.mark.parametrize(
+    ("detector", "options"),
+    [
+        ("geometric", ("--model", "nope.onnx")),
+        ("yolo", ("--boxes", "nope")),
+        ("recorded", ("--layout", "yolox", "--boxes", "nope")),
+    ],
+)
+def test_an_option_that_a_detector_does_not_read_is_refused(
+    detector: str, options: tuple[str, ...], small_session: Path, tmp_path: Path
+) -> None:
+    ended = tubepose("estimate", small_session, "--detector", detector, *options, "--out", tmp_path / "out")
+    assert ended.code == 1
+    assert ended.errors == [f"error: {options[0]} given, but --detector {detector} has no use for it; leave it out"]
+    assert not (tmp_path / "out").exists()

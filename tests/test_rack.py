@@ -1,6 +1,7 @@
 """Registration of the rack by its edges: recovery, what tells racks and turns apart, and every refusal."""
 
 import dataclasses
+import re
 
 import numpy as np
 import pytest
@@ -95,11 +96,23 @@ def test_a_hint_far_from_both_places_decides_nothing(soft_scan):
     for pixel in ((-5000.0, 300.0), (9000.0, 9000.0)):
         pose = register_rack(soft_scan, SOFT, CONFIG, SlotHint(slot="A1", pixel=pixel), scenes.CAMERA)
         assert (pose.ambiguous, pose.resolved_by) == (True, "rule")
+        said = re.fullmatch(
+            rf"the hint says that A1 is seen at {pixel[0]:.0f},{pixel[1]:.0f}, but it is at (-?\d+),(-?\d+) or, "
+            r"the rack turned, at (-?\d+),(-?\d+): point nearer to one of them",
+            pose.hint_note,
+        )
+        assert said
+        # Whoever points where it says is understood.
+        told = SlotHint(slot="A1", pixel=(float(said[3]), float(said[4])))
+        again = register_rack(soft_scan, SOFT, CONFIG, told, scenes.CAMERA)
+        assert (again.resolved_by, again.hint_note) == ("hint", "")
 
 
 def test_a_hint_without_intrinsics_is_not_used(soft_scan):
     pose = register_rack(soft_scan, SOFT, CONFIG, SlotHint(slot="A1", pixel=(0.0, 0.0)), None)
     assert (pose.ambiguous, pose.resolved_by) == (True, "rule")
+    assert pose.hint_note.startswith("the hint for A1 is a pixel, and this cloud has none")
+    assert register_rack(soft_scan, SOFT, CONFIG, None, None).hint_note == ""
 
 
 @pytest.mark.parametrize("yaw_deg", [10, 100, 190, 280])

@@ -19,7 +19,7 @@ from tubepose.rack_agreement import Agreement, contradiction, measure_agreement,
 from tubepose.rack_evidence import likelier_step_m
 from tubepose.rack_field import top_field
 from tubepose.rack_fit import HOPELESS_SHARE, Fit, RoughFit, camera_place, rack_frame, refine, roughly, top_frame
-from tubepose.rack_pose import MIN_POINTS, RackPose, RackStatus, choose_turn
+from tubepose.rack_pose import MIN_POINTS, RackPose, RackStatus, choose_turn, unused_hint
 from tubepose.rack_search import Band, levels, search
 from tubepose.transforms import HALF_TURN, FloatArray, make_transform
 
@@ -240,6 +240,9 @@ def _pose(
         seen.coverage,
         ambiguous=resolved_by == "rule" and not reason,
         resolved_by="" if reason else resolved_by,
+        hint_note=unused_hint(best.fit.T_camera_rack, T_turned, rack, hint, intrinsics)
+        if resolved_by == "rule" and not reason
+        else "",
         turn_margin_m=margin_m if index == 0 else -margin_m,
         spacing_m=seen.spacing_m,
         covariance=None if reason else _turned_covariance(chosen.fit.covariance, index == 1 and turned is best),

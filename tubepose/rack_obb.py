@@ -27,7 +27,7 @@ from tubepose.preprocessing import (
     voxel_downsample,
 )
 from tubepose.rack_acceptance import agreement, outline_words, refusal, too_coarse
-from tubepose.rack_pose import MIN_POINTS, RackPose, RackStatus, choose_turn
+from tubepose.rack_pose import MIN_POINTS, RackPose, RackStatus, choose_turn, unused_hint
 from tubepose.transforms import HALF_TURN, FloatArray, invert_transform, make_transform, transform_points
 
 
@@ -83,6 +83,9 @@ def register_obb_icp(
         coverage,
         ambiguous=resolved_by == "rule" and not reason,
         resolved_by="" if reason else resolved_by,
+        hint_note=unused_hint(best.T_camera_rack, turned.T_camera_rack, rack, hint, intrinsics)
+        if resolved_by == "rule" and not reason
+        else "",
         turn_margin_m=margin_m if chosen is best else -margin_m,
         spacing_m=spacing_m,
     )

@@ -48,6 +48,7 @@ class RackPose:
             z (metres), in the rack frame about the centre of the rack's top. None without a pose, and from a method
             that does not state it.
         rack: The rack that was found where it was not given but looked for; None otherwise.
+        hint_note: Why a hint that was given decided nothing, where one was needed; empty otherwise.
         named_by_margin: By how much the rack's agreement beats the next one's of the catalogue, where the rack was
             named by that: 0 is no difference; NaN otherwise.
     """
@@ -66,6 +67,7 @@ class RackPose:
     covariance: FloatArray | None = None
     rack: RackModel | None = None
     named_by_margin: float = float("nan")
+    hint_note: str = ""
 
 
 def choose_turn(
@@ -91,12 +93,42 @@ def choose_turn(
     if margin_m > config.ambiguous_margin_m:
         return 0, "geometry"
     if hint is not None and intrinsics is not None:
-        point = np.array([*rack.slot(hint.slot).center_m, rack.height_m])
-        pixels = [intrinsics.project(transform_points(T, point)) for T in (T_camera_best, T_camera_turned)]
-        distances = [float(np.hypot(*(pixel - np.array(hint.pixel)))) for pixel in pixels]
+        pixels = _hinted(T_camera_best, T_camera_turned, rack, hint, intrinsics)
+        distances = np.hypot(*(pixels - np.array(hint.pixel)).T)
         # A hint far from both places says nothing: swapped coordinates, or a pixel of another image.
         near = 0.25 * float(np.hypot(*(pixels[0] - pixels[1])))
-        if min(distances) < near < abs(distances[0] - distances[1]):
-            return (0 if distances[0] < distances[1] else 1), "hint"
+        if distances.min() < near < abs(distances[0] - distances[1]):
+            return int(distances.argmin()), "hint"
     # Decided by the image's diagonal: racks stand along the image's sides more often than along its diagonal.
     return (0 if T_camera_best[:2, 0].sum() > 0 else 1), "rule"
+
+
+def unused_hint(
+    T_camera_best: FloatArray,
+    T_camera_turned: FloatArray,
+    rack: RackModel,
+    hint: SlotHint | None,
+    intrinsics: CameraIntrinsics | None,
+) -> str:
+    """Why a hint has not decided between two turns, in words; empty without a hint."""
+    if hint is None:
+        return ""
+    if intrinsics is None:
+        return f"the hint for {hint.slot} is a pixel, and this cloud has none: give an organised cloud or an image"
+    (u, v), (other_u, other_v) = _hinted(T_camera_best, T_camera_turned, rack, hint, intrinsics)
+    return (
+        f"the hint says that {hint.slot} is seen at {hint.pixel[0]:.0f},{hint.pixel[1]:.0f}, but it is at "
+        f"{u:.0f},{v:.0f} or, the rack turned, at {other_u:.0f},{other_v:.0f}: point nearer to one of them"
+    )
+
+
+def _hinted(
+    T_camera_best: FloatArray,
+    T_camera_turned: FloatArray,
+    rack: RackModel,
+    hint: SlotHint,
+    intrinsics: CameraIntrinsics,
+) -> FloatArray:
+    """Pixels (2, 2) where the hint's slot is seen in either turn."""
+    point = np.array([*rack.slot(hint.slot).center_m, rack.height_m])
+    return np.stack([intrinsics.project(transform_points(T, point)) for T in (T_camera_best, T_camera_turned)])

@@ -21,7 +21,7 @@ RACK_COVARIANCE_AXES = ("rx", "ry", "rz", "tx", "ty", "tz")
 RACK_COVARIANCE_COLUMNS = upper_half(RACK_COVARIANCE_AXES)
 RACK_COLUMNS = (
     "session", "trial", "capture", "frame", "timestamp_ns", "method", "rack", "status", "reason", "ambiguous",
-    "resolved_by", "turn_margin_m", "inlier_rmse_m", "fitness", "in_slot_share", "coverage", "spacing_m",
+    "resolved_by", "hint_note", "turn_margin_m", "inlier_rmse_m", "fitness", "in_slot_share", "coverage", "spacing_m",
     "n_tubes_detected", "box_source", "box_score", "box_note", *POSE_COLUMNS,
     "named_by_margin", *RACK_COVARIANCE_COLUMNS,
 )  # fmt: skip
@@ -81,6 +81,7 @@ def rack_row(scene: Scene) -> Row:
         "reason": pose.reason,
         "ambiguous": pose.ambiguous,
         "resolved_by": pose.resolved_by,
+        "hint_note": pose.hint_note,
         "turn_margin_m": pose.turn_margin_m,
         "inlier_rmse_m": pose.inlier_rmse_m,
         "fitness": pose.fitness,

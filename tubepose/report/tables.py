@@ -192,7 +192,7 @@ def _accuracy_cells(values: pd.DataFrame) -> pd.DataFrame:
 def timing_table(timings: pd.DataFrame, notes: Sequence[str] = (), published: bool = False) -> Table:
     """Table II: time per component, without warm-up; the tube's stage once per method.
 
-    Loading and writing have no row; their means stand in a note.
+    Loading has no row; its mean stands in a note.
 
     Args:
         timings: Rows of timings.csv.
@@ -259,7 +259,7 @@ def _timing_cells(values: pd.DataFrame) -> pd.DataFrame:
 
 def _apart(timings: pd.DataFrame) -> list[str]:
     measured = timings[~timings["warmup"].astype(bool)]
-    found = [(stage, measured.loc[measured["stage"] == stage, "duration_ms"]) for stage in ("load", "write")]
+    found = [(stage, measured.loc[measured["stage"] == stage, "duration_ms"]) for stage in ("load",)]
     parts = [f"{stage} {_number(ms.mean())} ms (mean of {len(ms)})" for stage, ms in found if len(ms)]
     return [f"Not in the rows: {', '.join(parts)}."] if parts else []
 
