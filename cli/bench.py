@@ -90,9 +90,9 @@ def bench(
         ],
         problems=[*problems, *measured.problems], detector=detector, ground_truth_config=measured.config,
     )  # fmt: skip
-    if len(measured.truth) and tables.racks:
+    if len(measured.truth):
         _report(tables, measured, jobs, names, settings, out, seeds, published)
-    elif measured.sessions and not len(measured.truth):
+    elif measured.sessions and not exact_truth:
         say("no trial has a capture with printed caps that could be measured: no errors, no tables")
     finish([*problems, *measured.problems, *tables.problems])
 

@@ -106,7 +106,12 @@ def estimate(
         if row["status"] == "ok":
             rack_words = f"ok, inlier rmse {row['inlier_rmse_m'] * 1e3:.2f} mm{turn}"
         else:
-            rack_words = f"{row['status']}: {row['reason']}"
+            others = (
+                "; --rack auto tells which of the catalogue's it is"
+                if row["status"] in ("refused", "not_found")
+                else ""
+            )
+            rack_words = f"{row['status']}: {row['reason']}{others}"
         keys = ("session", "trial", "capture", "frame", "method")
         tubes_words = describe_tubes([e for e in tables.estimates if all(e[key] == row[key] for key in keys)])
         say(f"{row['capture']} frame {row['frame']}: rack {row['rack']} {rack_words}; {tubes_words}")

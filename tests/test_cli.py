@@ -748,3 +748,16 @@ def test_an_option_that_a_detector_does_not_read_is_refused(
     assert ended.code == 1
     assert ended.errors == [f"error: {options[0]} given, but --detector {detector} has no use for it; leave it out"]
     assert not (tmp_path / "out").exists()
+
+
+def test_a_session_without_a_readable_capture_has_all_its_tubes_missed(small_session: Path, tmp_path: Path) -> None:
+    session = tmp_path / "broken"
+    shutil.copytree(small_session, session)
+    text = (session / "session.yaml").read_text()
+    (session / "session.yaml").write_text(re.sub(r"original: (\S+)", r"original: \1-gone", text))
+    ended = tubepose("bench", session, "--methods", "upright", "--out", tmp_path / "out")
+    assert ended.code == 1
+    assert ended.errors
+    errors = table(tmp_path / "out" / "errors.csv")
+    assert len(errors)
+    assert set(errors["outcome"]) == {"missed"}

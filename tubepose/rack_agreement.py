@@ -38,6 +38,10 @@ INDEPENDENT_M = 1.5e-3
 THROUGH_MARGIN_M = 0.5e-3
 STRIP_POINTS = 3000
 SPACING_SAMPLE = 300
+# So many reasons are told of: the others follow from them as a rule.
+MOST_TOLD = 2
+# A pose that is known no better than this is not known at all.
+LOST_DEG = 90.0
 # Degrees and millimetres, with their part of a covariance.
 _UNITS = ((np.rad2deg(1.0), slice(0, 3)), (1e3, slice(3, 6)))
 
@@ -171,7 +175,9 @@ def outline_fits(seen: Agreement, config: RackConfig) -> bool:
 def contradiction(seen: Agreement, fit: Fit, rack: RackModel, config: RackConfig) -> str:
     """Why a fit is not the rack, in words; empty if it is."""
     checks = (*_misfits(seen, fit, rack, config), *_too_little(seen, fit, config))
-    return "; ".join(text for failed, text in checks if failed)
+    found = [text for failed, text in checks if failed]
+    more = len(found) - MOST_TOLD
+    return "; ".join(found[:MOST_TOLD]) + (f"; and {more} more like it" if more > 0 else "")
 
 
 def _misfits(seen: Agreement, fit: Fit, rack: RackModel, config: RackConfig) -> tuple[tuple[bool, str], ...]:
@@ -231,7 +237,9 @@ def _too_little(seen: Agreement, fit: Fit, config: RackConfig) -> tuple[tuple[bo
         ),
         (
             turn_deg > config.max_turn_std_deg or shift_mm > config.max_shift_std_mm,
-            f"its pose is uncertain by {turn_deg:.2f} deg and {shift_mm:.2f} mm (standard deviations), "
+            "its pose cannot be told at all: too little is seen"
+            if turn_deg > LOST_DEG
+            else f"its pose is uncertain by {turn_deg:.2f} deg and {shift_mm:.2f} mm (standard deviations), "
             f"at most {config.max_turn_std_deg:g} deg, {config.max_shift_std_mm:g} mm expected: too little is seen",
         ),
     )

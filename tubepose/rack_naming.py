@@ -15,7 +15,7 @@ from tubepose.rack_search import levels
 from tubepose.transforms import FloatArray
 
 # Racks in a reason: the first ones tell enough.
-TOLD = 3
+TOLD = 2
 # Places that are looked at per rack and level direction.
 PLACES = 5
 
@@ -82,8 +82,11 @@ def name_rack(
 def _not_named(ranking: Sequence[RankedRack], known: int, config: Config) -> str:
     """Why no rack can be named, in words; empty if the first one is it."""
     if not ranking or ranking[0].reason:
-        told = "; ".join(f"{entry.rack.name}: {entry.reason}" for entry in ranking[:TOLD]) or "no level band at all"
-        return f"no rack of the {known} known ones fits; the nearest are {told}"
+        told = ", ".join(f"{entry.rack.name} ({entry.reason.split('; ')[0]})" for entry in ranking[:TOLD])
+        return (
+            f"no rack of the {known} known ones fits; the nearest are {told or 'none: there is no level band at all'}; "
+            "give your own by --rack FILE, or --rack grid with --pitch and --slot"
+        )
     if ranking[0].evidence >= config.rack.min_rival_ratio * _rival(ranking):
         return ""
     told = ", ".join(f"{entry.rack.name} ({entry.evidence:.0f} nats)" for entry in ranking[:TOLD])
