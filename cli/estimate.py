@@ -65,7 +65,15 @@ def estimate(
     from tubepose.capture.session import SESSION_FILE, is_session
     from tubepose.config import load_config
     from tubepose.errors import CaptureError, TubePoseError
-    from tubepose_cli.inputs import capture_jobs, make_detector, read_methods, read_tubes, refuse_twins, used_model
+    from tubepose_cli.inputs import (
+        capture_jobs,
+        make_detector,
+        read_methods,
+        read_tubes,
+        refuse_twins,
+        sessions_below,
+        used_model,
+    )
     from tubepose_cli.racks import read_rack
     from tubepose_cli.results import run_estimates
     from tubepose_cli.show import describe_tubes, finish, say
@@ -78,6 +86,7 @@ def estimate(
     topics = {"cloud": cloud_topic, "depth": depth_topic, "image": image_topic, "info": info_topic}
     jobs: list[Job] = []
     problems: list[str] = []
+    captures = [found for path in captures for found in (sessions_below(path) or [path])]
     for path in captures:
         try:
             found, unread = capture_jobs(

@@ -72,7 +72,7 @@ def find_sessions(paths: Sequence[Path], *, fail_fast: bool = False) -> tuple[li
     problems: list[str] = []
     for path in paths:
         folder = path.parent if path.name == "session.yaml" else path
-        found = [folder] if is_session(folder) else sorted(p.parent for p in folder.glob("*/session.yaml"))
+        found = [folder] if is_session(folder) else sessions_below(folder)
         sessions += found
         if not path.exists():
             problems.append(f"{path}: no such file or folder; expected a session folder")
@@ -81,6 +81,13 @@ def find_sessions(paths: Sequence[Path], *, fail_fast: bool = False) -> tuple[li
         if problems and fail_fast:
             raise CaptureError(problems[0])
     return sessions, problems
+
+
+def sessions_below(path: Path) -> list[Path]:
+    """Sessions one folder below a folder that is none itself."""
+    from tubepose.capture.session import SESSION_FILE, is_session
+
+    return [] if is_session(path) else sorted(found.parent for found in path.glob(f"*/{SESSION_FILE}"))
 
 
 def capture_jobs(

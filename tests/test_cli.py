@@ -761,3 +761,14 @@ def test_a_session_without_a_readable_capture_has_all_its_tubes_missed(small_ses
     errors = table(tmp_path / "out" / "errors.csv")
     assert len(errors)
     assert set(errors["outcome"]) == {"missed"}
+
+
+def test_a_folder_of_sessions_is_each_of_them(small_session: Path, tmp_path: Path) -> None:
+    above = tmp_path / "all"
+    for name in ("one", "two"):
+        shutil.copytree(small_session, above / name)
+        file = above / name / "session.yaml"
+        file.write_text(re.sub(r"^name: .*", f"name: {name}", file.read_text(), flags=re.MULTILINE))
+    ended = tubepose("estimate", above, "--method", "upright", "--no-overlays", "--out", tmp_path / "out")
+    assert ended.errors == []
+    assert set(table(tmp_path / "out" / "racks.csv")["session"]) == {"one", "two"}
