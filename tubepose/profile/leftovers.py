@@ -19,6 +19,8 @@ CORE_SHARE = 0.6
 LEVEL_M = 2.5e-3
 LEVEL_SHARE = 0.6
 """A top is level: this share of its points lies this near their median height. Light behind glass is not."""
+SAME_HEIGHT_M = 1.0e-3
+"""Something this near to a type's height is no other type by its height."""
 LYING_PITCHES = 1.6
 """Something longer than this many pitches stands in no slot."""
 
@@ -105,6 +107,12 @@ def _judge(
         if area_m2 < np.pi * (0.3 * pitch_m) ** 2:
             return None
         return Leftover(slot, f"a second top in slot {rack.all_slots[slot].name}, {height_m * 1e3:.1f} mm high", rows)
+    alike = [tube.name for tube in tubes if abs(tube.height_m - height_m) < SAME_HEIGHT_M]
+    if alike:
+        reason = (
+            f"{height_m * 1e3:.1f} mm high as {alike[0]} is, but no top of it: in part, another one, or a coarse scan"
+        )
+        return Leftover(slot, reason, rows)
     heights = ", ".join(f"{tube.name} {tube.height_mm:g}" for tube in tubes)
     expected = f"expected (mm): {heights}; or it stands on something" if tubes else "no tube model given (--tubes)"
     return Leftover(slot, f"unknown type: {height_m * 1e3:.1f} mm high, {expected}", rows)
