@@ -60,7 +60,9 @@ def test_a_top_of_a_height_that_no_type_has():
 
 def test_a_type_is_not_called_unknown_at_its_own_height():
     (found,) = find(disc(SLOT.center_m, 7e-3, RACK.floor_m + 0.1003))
-    assert found.reason == "100.3 mm high as chen2023-tube-2 is, but no top of it: in part, another one, or a coarse scan"
+    assert found.reason == (
+        "100.3 mm high as chen2023-tube-2 is, but no top of it: in part, another one, or a coarse scan"
+    )
 
 
 def test_a_second_top_in_a_slot_that_is_taken():
