@@ -15,7 +15,7 @@ MARGIN = 0.08
 """By how much the picture of a rack is wider than its box on every side, as a share of the box's longer side."""
 LEAST_SCORE = 0.3
 """Score from which a rack is worth a look."""
-LEAST_TUBE_SCORE = 0.1
+LEAST_TUBE_SCORE = 0.2
 """Score from which something outside of racks may be a tube, and the whole picture is worth a larger look."""
 MOST_RACKS = 8
 """More racks than this in one picture, the best first, are not looked at again."""
