@@ -58,11 +58,11 @@ def boxes_alone(scene: Scene, found: Sequence[ProfileTube], config: Config) -> l
     posed = [(tube.pose.T_rack_tube, tube.tube.height_m) for tube in found if tube.tube is not None]
     tops_m = np.array([T[:3, 3] + height_m * T[:3, 2] for T, height_m in posed if T is not None]).reshape(-1, 3)
     pixels = scene.intrinsics.project(transform_points(T_camera_rack, tops_m))
-    rest = [
-        k
-        for k, box in enumerate(scene.detections)
-        if not box.is_rack and box.score >= SURE_SCORE and not _holds_any(box, pixels)
-    ]
+    sure = [k for k, box in enumerate(scene.detections) if not box.is_rack and box.score >= SURE_SCORE]
+    boxes = np.array([scene.detections[k].box_xyxy_px for k in sure], float).reshape(-1, 1, 4)
+    holds = np.any(np.all((pixels >= boxes[..., :2]) & (pixels <= boxes[..., 2:]), axis=2), axis=1)
+    # A box without edges says nothing of where its tube is seen.
+    rest = [k for k, told in zip(sure, ~holds & np.isfinite(boxes[:, 0]).all(axis=1), strict=True) if told]
     taken = {tube.slot for tube in found}
     reason = "a tube is detected here, but none of the given types was found in the slot"
     return [
@@ -72,14 +72,6 @@ def boxes_alone(scene: Scene, found: Sequence[ProfileTube], config: Config) -> l
         )
         if entry.slot is not None and entry.slot not in taken
     ]
-
-
-def _holds_any(box: Detection, pixels: FloatArray) -> bool:
-    """Whether a box holds one of some pixels (N, 2); one without edges says nothing, and counts as if it did."""
-    left, top, right, bottom = box.box_xyxy_px
-    if not np.isfinite(box.box_xyxy_px).all():
-        return True
-    return bool(((pixels >= (left, top)) & (pixels <= (right, bottom))).all(axis=1).any())
 
 
 def _assigned(

@@ -57,9 +57,9 @@ class Posterior:
 
 def per_model(models: Sequence[TubeModel], value: Callable[[TubeModel], object]) -> FloatArray:
     """A value of every tube's model, computed once per model, as an array."""
-    known = {id(model): model for model in models}
-    values = {key: value(model) for key, model in known.items()}
-    return np.array([values[id(model)] for model in models], dtype=float)
+    keys = [*map(id, models)]
+    values = {key: value(model) for key, model in dict(zip(keys, models, strict=True)).items()}
+    return np.array([*map(values.__getitem__, keys)], dtype=float)
 
 
 def no_evidence(count: int) -> Evidence:

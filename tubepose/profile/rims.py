@@ -125,6 +125,8 @@ def _ring_scores(
 
     The last two have the shape (T, SECTORS, M).
     """
+    if len(radii_m) and not np.ptp(radii_m, axis=0).any():
+        radii_m = radii_m[:1]  # one template does for all
     half = ((radii_m[:, 1] - radii_m[:, 0]) / 2)[:, None, None]
     moves = np.arange(-search_m, search_m + BIN_M / 4, BIN_M / 2)
     # A ring blurred by a bin, with a background as wide as itself on either side.
