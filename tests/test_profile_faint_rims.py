@@ -42,6 +42,14 @@ def test_a_ring_without_a_single_point_is_measured_where_it_is(shift_mm):
     assert not (found.contrast[[0, 2]] > CONFIG.min_ring_contrast).any()
 
 
+def test_a_dark_ring_is_a_rim_that_leads_its_light_away():
+    place = CENTERS_M[1] + np.array([2e-3, -1e-3])
+    found = look(255 - drawn(VIEW, place, clutter=15.0))
+    assert found.contrast[1] > 0.75
+    assert found.center_m[1] + found.circles.offset_m[1] == pytest.approx(place, abs=1e-4)
+    assert not (found.contrast[[0, 2]] > CONFIG.min_ring_contrast).any()
+
+
 def test_three_rings_are_three_rims():
     places = CENTERS_M + np.array([[1e-3, 0.0], [0.0, 2e-3], [-2e-3, -2e-3]])
     found = look(drawn(VIEW, *places))
@@ -64,12 +72,11 @@ MIDDLE_M = (INNER_M + OUTER_M) / 2
     [
         lambda rho: np.where(rho < MIDDLE_M, 160.0, 60.0),  # a disc as large as the rim
         lambda rho: np.where(rho < MIDDLE_M, 60.0, 160.0),  # a hole
-        lambda rho: np.where((rho > INNER_M) & (rho < OUTER_M), 60.0, 160.0),  # a dark ring
         lambda rho: np.where((rho > INNER_M - 4e-3) & (rho < OUTER_M - 4e-3), 160.0, 60.0),  # another size
         lambda rho: np.full(rho.shape, 100.0),
     ],
 )
-def test_what_is_no_bright_ring_of_that_size_is_no_rim(gray_of_rho):
+def test_what_is_no_ring_of_that_size_is_no_rim(gray_of_rho):
     assert not (look(painted(gray_of_rho)).contrast >= CONFIG.min_ring_contrast).any()
 
 

@@ -1,16 +1,17 @@
 """Rims that the image shows and the cloud does not: those of clear plastic, which hardly returns a point.
 
-The image is laid onto the level of the rims, where all of them are circles of one size. About every slot each place
-that a rim can have is judged by votes of directions: for a ring that is brighter than both of its sides, against one
-that is darker, nothing for an edge. The best place of a slot that wins enough of them is then measured as any rim is,
-and believed if nearly all of its circle is free to be seen and looks like a ring. Neither test knows of the other: the
-votes see whether a side is brighter and not by how much, the correlation how a ring's whole width looks.
+Such a rim is a bright ring where it scatters some light back, and a dark one where it leads all of it away. The image
+is laid onto the level of the rims, where all of them are circles of one size. About every slot each place that a rim
+can have is judged by votes of directions: for a ring that is brighter than both of its sides, against one that is
+darker, nothing for an edge; and the same in the negative. The best place of a slot that wins enough of them is then
+measured as any rim is, and believed if nearly all of its circle is free to be seen and looks like a ring. Neither test
+knows of the other: the votes see whether a side is brighter and not by how much, the correlation how a ring looks.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -53,6 +54,14 @@ class FaintRims:
     circles: Circles
     contrast: FloatArray
 
+    def where(self, mine: NDArray[np.bool_], other: FaintRims) -> FaintRims:
+        """These rims where `mine`, shape (S,), is True, the other's elsewhere."""
+        return FaintRims(
+            np.where(mine[:, None], self.center_m, other.center_m),
+            self.circles.where(mine, other.circles),
+            np.where(mine, self.contrast, other.contrast),
+        )
+
 
 def find_faint_rims(
     frame: RgbdFrame,
@@ -80,6 +89,28 @@ def find_faint_rims(
         standing: Points above the rack's top: a ring of them at another height is a rim of something else.
         config: Limits, and noise of outlines.
     """
+    assert frame.image is not None
+    negative = replace(frame, image=np.max(frame.image) - frame.image)
+    bright, dark = (
+        _bright_rims(one, intrinsics, T_camera_rack, center_m, reach_m, level_m, radii_m, blocked_at, standing, config)
+        for one in (frame, negative)
+    )
+    return bright.where(bright.contrast >= dark.contrast, dark)
+
+
+def _bright_rims(
+    frame: RgbdFrame,
+    intrinsics: CameraIntrinsics,
+    T_camera_rack: FloatArray,
+    center_m: FloatArray,
+    reach_m: float,
+    level_m: float,
+    radii_m: FloatArray,
+    blocked_at: Callable[[FloatArray], NDArray[np.bool_]],
+    standing: Standing,
+    config: ProfileConfig,
+) -> FaintRims:
+    """`find_faint_rims` for rings that are brighter than both of their sides."""
     middle, votes = _likeliest(frame, intrinsics, T_camera_rack, center_m, reach_m, level_m, radii_m)
     circles, contrast = unknown_circles(len(center_m)), np.full(len(center_m), -np.inf)
     at = np.flatnonzero(votes >= config.min_ring_votes)
