@@ -7,7 +7,7 @@ from test_profile_rims import CAMERA, INNER_M, LEVEL_M, OUTER_M, RACK, VIEW, dra
 from tubepose.config import Config, ProfileConfig
 from tubepose.labware import load_tube
 from tubepose.profile import fit_profiles
-from tubepose.profile.faint_rims import find_faint_rims
+from tubepose.profile.faint_rims import RimSearch, find_faint_rims
 from tubepose.profile.measure import blocked_sectors
 from tubepose.profile.outline import SECTORS
 from tubepose.profile.standing import Standing
@@ -27,10 +27,10 @@ NOTHING = Standing(np.empty((0, 3)), invert_transform(VIEW)[:3, 3])
 
 
 def look(image, centers_m=CENTERS_M, blocked_at=free, config=CONFIG, standing=NOTHING):
-    return find_faint_rims(
-        frame_of(image), CAMERA, VIEW, centers_m, REACH_M, LEVEL_M, np.array([INNER_M, OUTER_M]), blocked_at, standing,
-        config,
-    )  # fmt: skip
+    search = RimSearch(
+        CAMERA, VIEW, centers_m, REACH_M, LEVEL_M, np.array([INNER_M, OUTER_M]), blocked_at, standing, config
+    )
+    return find_faint_rims(frame_of(image), search)
 
 
 @pytest.mark.parametrize("shift_mm", [(0.0, 0.0), (3.5, -1.0), (-2.0, 3.0)])

@@ -9,14 +9,13 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
+
+from tubepose.compiled import compiled, solved
 
 # Bins that a median is counted in: it is exact to the range of values over this.
 MEDIAN_BINS = 2048
 # Bins per half window that the densest height is looked for in.
 MODE_BINS = 20
-
-compiled = njit(cache=True, error_model="numpy")
 
 
 @compiled
@@ -150,24 +149,6 @@ def cluster_sums(xy_m, scores, side_m):
         for m in range(scores.shape[1]):
             sums[cell, m] += scores[k, m]
     return sums.T @ sums, filled.sum()
-
-
-@compiled
-def solved(matrix, right):
-    """Solution (n,) of a small symmetric positive definite system, by Gaussian elimination."""
-    a, b = matrix.copy(), right.copy()
-    n = len(b)
-    for i in range(n):
-        for j in range(i + 1, n):
-            factor = a[j, i] / a[i, i]
-            for k in range(i, n):
-                a[j, k] -= factor * a[i, k]
-            b[j] -= factor * b[i]
-    for i in range(n - 1, -1, -1):
-        for k in range(i + 1, n):
-            b[i] -= a[i, k] * b[k]
-        b[i] /= a[i, i]
-    return b
 
 
 @compiled

@@ -6,7 +6,8 @@ import math
 
 import numpy as np
 
-from tubepose.rack_kernels import compiled, in_frame
+from tubepose.compiled import compiled
+from tubepose.rack_kernels import in_frame
 
 
 @compiled

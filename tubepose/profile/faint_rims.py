@@ -63,23 +63,12 @@ class FaintRims:
         )
 
 
-def find_faint_rims(
-    frame: RgbdFrame,
-    intrinsics: CameraIntrinsics,
-    T_camera_rack: FloatArray,
-    center_m: FloatArray,
-    reach_m: float,
-    level_m: float,
-    radii_m: FloatArray,
-    blocked_at: Callable[[FloatArray], NDArray[np.bool_]],
-    standing: Standing,
-    config: ProfileConfig,
-) -> FaintRims:
-    """Look for a rim in each of some slots.
+@dataclass(frozen=True, slots=True, eq=False)
+class RimSearch:
+    """Where rims are looked for, and what they have to be.
 
-    Args:
-        frame: The frame, organised, with an image.
-        intrinsics: Of its image.
+    Attributes:
+        intrinsics: Of the frame's image.
         T_camera_rack: The rack's pose, shape (4, 4), metres.
         center_m: Middles of the slots, rack frame, shape (S, 2), metres.
         reach_m: How far from there a rim's middle can be, metres.
@@ -89,92 +78,84 @@ def find_faint_rims(
         standing: Points above the rack's top: a ring of them at another height is a rim of something else.
         config: Limits, and noise of outlines.
     """
+
+    intrinsics: CameraIntrinsics
+    T_camera_rack: FloatArray
+    center_m: FloatArray
+    reach_m: float
+    level_m: float
+    radii_m: FloatArray
+    blocked_at: Callable[[FloatArray], NDArray[np.bool_]]
+    standing: Standing
+    config: ProfileConfig
+
+
+def find_faint_rims(frame: RgbdFrame, search: RimSearch) -> FaintRims:
+    """Look for a rim in each of some slots of a frame that is organised and has an image."""
     assert frame.image is not None
     negative = replace(frame, image=np.max(frame.image) - frame.image)
-    bright, dark = (
-        _bright_rims(one, intrinsics, T_camera_rack, center_m, reach_m, level_m, radii_m, blocked_at, standing, config)
-        for one in (frame, negative)
-    )
+    bright, dark = (_bright_rims(one, search) for one in (frame, negative))
     return bright.where(bright.contrast >= dark.contrast, dark)
 
 
-def _bright_rims(
-    frame: RgbdFrame,
-    intrinsics: CameraIntrinsics,
-    T_camera_rack: FloatArray,
-    center_m: FloatArray,
-    reach_m: float,
-    level_m: float,
-    radii_m: FloatArray,
-    blocked_at: Callable[[FloatArray], NDArray[np.bool_]],
-    standing: Standing,
-    config: ProfileConfig,
-) -> FaintRims:
+def _bright_rims(frame: RgbdFrame, search: RimSearch) -> FaintRims:
     """`find_faint_rims` for rings that are brighter than both of their sides."""
-    middle, votes = _likeliest(frame, intrinsics, T_camera_rack, center_m, reach_m, level_m, radii_m)
-    circles, contrast = unknown_circles(len(center_m)), np.full(len(center_m), -np.inf)
-    at = np.flatnonzero(votes >= config.min_ring_votes)
+    middle, votes = _likeliest(frame, search)
+    circles, contrast = unknown_circles(len(middle)), np.full(len(middle), -np.inf)
+    at = np.flatnonzero(votes >= search.config.min_ring_votes)
     if len(at) == 0:
         return FaintRims(middle, circles, contrast)
-    view = (frame, intrinsics, T_camera_rack)
-    size = (np.full(len(at), level_m), np.tile(radii_m, (len(at), 1)))
-    found = fit_rims(*view, middle[at], *size, blocked_at(middle[at]), config)
+    view = (frame, search.intrinsics, search.T_camera_rack)
+    size = (np.full(len(at), search.level_m), np.tile(search.radii_m, (len(at), 1)))
+    found = fit_rims(*view, middle[at], *size, search.blocked_at(middle[at]), search.config)
     place = middle[at] + np.nan_to_num(found.offset_m)
-    blocked = blocked_at(place)
+    blocked = search.blocked_at(place)
     seen = np.isfinite(found.offset_m[:, 0]) & ((~blocked).mean(axis=1) >= LEAST_FREE)
-    seen &= ~_at_another_height(standing, place, level_m, radii_m, config)
+    seen &= ~_at_another_height(place, search)
     contrast[at] = np.where(seen, ring_contrast(*view, place, *size, blocked), -np.inf)
     return FaintRims(middle, circles.put(at, found), contrast)
 
 
-def _at_another_height(
-    standing: Standing, center_m: FloatArray, level_m: float, radii_m: FloatArray, config: ProfileConfig
-) -> NDArray[np.bool_]:
+def _at_another_height(center_m: FloatArray, search: RimSearch) -> NDArray[np.bool_]:
     """Where most points that are seen on a ring, all around it, lie at one height that is not a rim's: shape (N,).
 
     Clear plastic leaves hardly a point there, or some at all heights.
     """
+    standing, (inner, outer) = search.standing, search.radii_m
     z = standing.points_m[:, 2]
     if len(z) == 0:
         return np.zeros(len(center_m), bool)
     low = float(z.min())
     bins = int((float(z.max()) - low) / BIN_M) + 1
     counts = ring_heights(
-        standing.points_m, standing.camera_m, level_m, center_m, radii_m[0], radii_m[1], low, BIN_M, bins, SECTORS
+        standing.points_m, standing.camera_m, search.level_m, center_m, inner, outer, low, BIN_M, bins, SECTORS
     )
     window = sum(np.roll(counts, shift, axis=1) for shift in (-1, 0, 1))  # three bins; low and high ends are far apart
     total, best = counts.sum(axis=(1, 2)), window.sum(axis=2).argmax(axis=1)
     most = window[np.arange(len(center_m)), best]
-    above = low + (best + 0.5) * BIN_M - level_m
-    expected = (above > -config.rim_depth_m) & (above < config.top_band_m)
+    above = low + (best + 0.5) * BIN_M - search.level_m
+    expected = (above > -search.config.rim_depth_m) & (above < search.config.top_band_m)
     one_height = (most.sum(axis=1) >= ONE_HEIGHT_SHARE * np.maximum(total, 1)) & (total > 0)
     return np.asarray(one_height & ((most > 0).mean(axis=1) >= ALL_AROUND) & ~expected)
 
 
-def _likeliest(
-    frame: RgbdFrame,
-    intrinsics: CameraIntrinsics,
-    T_camera_rack: FloatArray,
-    center_m: FloatArray,
-    reach_m: float,
-    level_m: float,
-    radii_m: FloatArray,
-) -> tuple[FloatArray, FloatArray]:
+def _likeliest(frame: RgbdFrame, search: RimSearch) -> tuple[FloatArray, FloatArray]:
     """Place of each slot that wins most votes, shape (S, 2), metres, and those votes, -1 to 1, shape (S,)."""
-    low = center_m.min(axis=0) - EDGE_M
-    picture = _laid_out(frame, intrinsics, T_camera_rack, low, center_m.max(axis=0) + EDGE_M, level_m)
+    low, high = search.center_m.min(axis=0) - EDGE_M, search.center_m.max(axis=0) + EDGE_M
+    picture = _laid_out(frame, search.intrinsics, search.T_camera_rack, low, high, search.level_m)
     angles = (np.arange(DIRECTIONS) + 0.5) * (2 * np.pi / DIRECTIONS)
     around = np.column_stack([np.cos(angles), np.sin(angles)])
-    middle_m, width_m = float(np.mean(radii_m)), float(np.ptp(radii_m))
+    middle_m, width_m = float(np.mean(search.radii_m)), float(np.ptp(search.radii_m))
     ring, inside, outside = (
         np.rint((middle_m + step) / CELL_M * around).astype(np.intp) for step in (0.0, -width_m, width_m)
     )
     least = LEAST_GRAY * float(np.ptp(picture)) + 1e-6
-    cells = np.rint((center_m - low) / CELL_M).astype(np.intp)
-    _, best = ring_votes(picture, cells, _disc(reach_m, COARSE), ring, inside, outside, least)
-    cells = cells + _disc(reach_m, COARSE)[best]
-    votes, best = ring_votes(picture, cells, _disc(COARSE * CELL_M, 1), ring, inside, outside, least)
-    return low + (cells + _disc(COARSE * CELL_M, 1)[best]) * CELL_M, votes
+    cells = np.rint((search.center_m - low) / CELL_M).astype(np.intp)
+    votes = np.empty(len(cells))
+    for shifts in (_disc(search.reach_m, COARSE), _disc(COARSE * CELL_M, 1)):
+        votes, best = ring_votes(picture, cells, shifts, ring, inside, outside, least)
+        cells = cells + shifts[best]
+    return low + cells * CELL_M, votes
 
 
 def _disc(reach_m: float, step: int) -> NDArray[np.intp]:

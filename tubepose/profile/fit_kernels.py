@@ -5,7 +5,8 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
+
+from tubepose.compiled import compiled, solved
 
 ROUNDS = 6
 """Of the reweighted least squares of circles."""
@@ -13,26 +14,6 @@ HUBER = 1.5
 """Residuals larger than this many standard deviations count as if they were that large."""
 LARGEST = 200.0
 """Exponents are cut here: the product of three such powers is still a number."""
-
-compiled = njit(cache=True, error_model="numpy")
-
-
-@compiled
-def solved(matrix, right):
-    """Solution (n,) of a small symmetric positive definite system, by Gaussian elimination."""
-    a, b = matrix.copy(), right.copy()
-    n = len(b)
-    for i in range(n):
-        for j in range(i + 1, n):
-            factor = a[j, i] / a[i, i]
-            for k in range(i, n):
-                a[j, k] -= factor * a[i, k]
-            b[j] -= factor * b[i]
-    for i in range(n - 1, -1, -1):
-        for k in range(i + 1, n):
-            b[i] -= a[i, k] * b[k]
-        b[i] /= a[i, i]
-    return b
 
 
 @compiled

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from tubepose.capture.frame import CameraIntrinsics, RgbdFrame
 from tubepose.config import Config, ProfileConfig
 from tubepose.labware import RackModel, TubeModel
-from tubepose.profile.faint_rims import find_faint_rims
+from tubepose.profile.faint_rims import RimSearch, find_faint_rims
 from tubepose.profile.kernels import cell_values, ends_on_planes, near_planes, nearest_tops
 from tubepose.profile.outline import NORMALS, OUTLINE_DEPTH_M, SECTORS, Circles, fit_discs, unknown_circles
 from tubepose.profile.plane import TopPlanes, fit_top_planes
@@ -169,12 +169,11 @@ def _with_faint_rims(
     for tube in (tubes[k] for k in types):
         radii = np.array([mouth_radius_m(tube), top_radius_m(tube)])
         reach_m = max(top_reach_m(rack.all_slots[i], tube, rack) for i in free)
-        seen.append(
-            find_faint_rims(
-                frame, intrinsics, T_camera_rack, rack.slot_centers_m[free], reach_m, top_level_m(tube, rack), radii,
-                partial(_blocked_by, *known, float(radii[1])), standing, config,
-            )
+        search = RimSearch(
+            intrinsics, T_camera_rack, rack.slot_centers_m[free], reach_m, top_level_m(tube, rack), radii,
+            partial(_blocked_by, *known, float(radii[1])), standing, config,
         )  # fmt: skip
+        seen.append(find_faint_rims(frame, search))
     contrast = np.stack([one.contrast for one in seen])
     if allowed is not None:
         contrast = np.where(allowed[np.ix_(types, free)], contrast, -np.inf)
