@@ -15,6 +15,7 @@ if TYPE_CHECKING:
 
 app = typer.Typer(help="Detectors that learn from labware files alone, and how good they are.", no_args_is_help=True)
 CATALOGUE = "catalogue"
+BUNDLED = "bundled"
 SUMMARY_FILE, SUCCESS_FILE, WORST_FILE = "detection_summary.csv", "detection_success.csv", "worst.png"
 _UNSEEN_SEED = 1_000_003
 """Added to a seed for pictures to judge by."""
@@ -81,7 +82,12 @@ def train(
         ),
     ] = None,
     start: Annotated[
-        Path | None, typer.Option(help="Start from a checkpoint.pt of another training, not from photographs alone.")
+        str | None,
+        typer.Option(
+            metavar="bundled|FILE",
+            help="Start from the bundled model, or from the .onnx or checkpoint.pt of another training; "
+            "default: from photographs.",
+        ),
     ] = None,
     rate: Annotated[float, typer.Option(min=1e-7, help="Largest learning rate.")] = 1e-3,
     unseen: Annotated[int, typer.Option(min=0, help="Further pictures to judge the model by; 0 for none.")] = 60,
@@ -103,8 +109,7 @@ def train(
     from tubepose_cli.show import counted_progress, say
     from tubepose_cli.simulate import available_cores
 
-    if start is not None and not start.is_file():
-        raise ConfigError(f"--start {start}: no such file; expected a checkpoint.pt of another training")
+    begin = _start_file(start)
     if out.suffix != ".onnx":
         raise ConfigError(f"--out {out}: expected a name that ends in .onnx")
     for name, value in (("--side", side), ("--whole-side", whole_side)):
@@ -126,7 +131,7 @@ def train(
     for place, source, count in sets:
         _render(place, source, count, cores)
     files = labelled_sets(images or [folder / "pictures"])
-    job = TrainingJob(files, out, folder, recipe, Looks(whole_side, side), cores, start)
+    job = TrainingJob(files, out, folder, recipe, Looks(whole_side, side), cores, begin)
     with counted_progress("steps") as show:
         report = train_detector(
             job, labelled_set(folder / "unseen") if unseen else None, lambda done, _loss: show(done, steps)
@@ -182,6 +187,22 @@ def evaluate(
         cv2.imwrite(str(aside), worst_sheet(files, report, kinds, score))
     show_report(report, f"{len(files.images)} pictures, score {score:g} or more, overlap 0.5")
     say(f"{out}: {SUMMARY_FILE}, {SUCCESS_FILE}, {WORST_FILE}")
+
+
+def _start_file(given: str | None) -> Path | None:
+    """The file that a training starts from."""
+    from tubepose.detection.bundled import bundled_model
+    from tubepose.errors import ConfigError
+
+    if given is None:
+        return None
+    if given == BUNDLED:
+        return bundled_model()
+    if not Path(given).is_file():
+        raise ConfigError(
+            f"--start {given}: no such file; expected {BUNDLED}, or the .onnx or checkpoint.pt of another training"
+        )
+    return Path(given)
 
 
 def _render(out: Path, source: ImageSet, count: int, threads: int) -> None:

@@ -164,3 +164,9 @@ def test_the_runtime_needs_nothing_but_the_file():
     session = onnxruntime.InferenceSession(str(bundled_model()), providers=["CPUExecutionProvider"])
     assert [entry.shape for entry in session.get_inputs()] == [[1, 3, "height", "width"]]
     assert [entry.type for entry in session.get_inputs()] == ["tensor(float)"]
+
+
+def test_a_start_that_is_no_file_is_refused(tmp_path):
+    ended = tubepose("detector", "train", "--out", tmp_path / "model.onnx", "--start", "nowhere.onnx")
+    assert ended.code == 1
+    assert ended.errors[0].startswith("error: --start nowhere.onnx: no such file; expected bundled, or the .onnx")

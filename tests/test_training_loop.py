@@ -100,6 +100,66 @@ def test_a_training_can_start_from_another_one(pictures, tmp_path):
         Trainer(recipe(), pictures, tmp_path / "third", threads=1, start=tmp_path / "junk.pt")
 
 
+@pytest.fixture
+def model(pictures, tmp_path):
+    """The file of a small network whose normalisations are far from where they start, and that network."""
+    torch.manual_seed(0)
+    network = build_network(3, pretrained=False)
+    for module in network.modules():
+        if isinstance(module, torch.nn.BatchNorm2d):
+            for values, low, high in (
+                (module.running_mean, -0.3, 0.3), (module.running_var, 0.5, 2), (module.weight.data, 0.6, 1.4),
+                (module.bias.data, -0.2, 0.2),
+            ):  # fmt: skip
+                values.uniform_(low, high)
+    file = tmp_path / "model.onnx"
+    export_onnx(network, file, CLASSES, Looks(96, 128), {"seed": 0}, sha256="0" * 64)
+    return file, network.eval()
+
+
+def test_a_training_can_start_from_a_models_file(pictures, tmp_path, model):
+    file, network = model
+    trainer = Trainer(recipe(steps=2), pictures, tmp_path / "next", threads=1, start=file)
+    images = torch.from_numpy(np.random.default_rng(0).integers(0, 256, (2, 3, 96, 96)).astype(np.float32))
+    with torch.no_grad():
+        expected, found = network(images), trainer.network.eval()(images)
+    assert torch.allclose(found, expected, rtol=1e-2, atol=1e-2)  # weights of 16 bits
+    # In training mode its normalisations meet what they expect: the first losses are those of the network before.
+    head = trainer.network.head.stems[0].bn
+    seen = []
+    handle = head.register_forward_pre_hook(lambda _layer, inputs: seen.append(inputs[0].detach()))
+    for step in range(8):
+        with torch.no_grad():
+            trainer.network.eval()(trainer._images(trainer.batch(step)[0]))
+    handle.remove()
+    stacked = torch.cat([x.transpose(0, 1).flatten(1) for x in seen], dim=1)
+    assert torch.allclose(head.running_mean, stacked.mean(dim=1), rtol=1e-3, atol=1e-4)
+    assert torch.allclose(head.running_var, stacked.var(dim=1, correction=0), rtol=1e-3, atol=1e-4)
+    trainer.run()
+    assert len(trainer.losses) == 2
+
+
+def test_what_is_no_model_to_start_from_is_refused(pictures, tmp_path, model):
+    from dataclasses import replace
+
+    file, _ = model
+    other = replace(pictures, classes=("rack", "tube", "vial"))
+    with pytest.raises(DetectorError, match=r"model\.onnx: a model of the classes .*tube-open.*vial"):
+        Trainer(recipe(), other, tmp_path / "other", threads=1, start=file)
+    (tmp_path / "junk.onnx").write_bytes(b"junk")
+    with pytest.raises(DetectorError, match=r"junk\.onnx: no model to start from"):
+        Trainer(recipe(), pictures, tmp_path / "junk", threads=1, start=tmp_path / "junk.onnx")
+    import onnx
+
+    foreign = onnx.load(str(file))
+    for node in foreign.graph.node:
+        if node.op_type == "Conv":
+            node.name = node.name.replace("head", "feet")
+    onnx.save(foreign, str(tmp_path / "foreign.onnx"))
+    with pytest.raises(DetectorError, match=r"foreign\.onnx: no model to start from \(\d+ of \d+ layers are in it\)"):
+        Trainer(recipe(), pictures, tmp_path / "foreign", threads=1, start=tmp_path / "foreign.onnx")
+
+
 def test_the_file_gives_what_the_network_gives(pictures, tmp_path):
     torch.manual_seed(0)
     network = build_network(3, pretrained=False).eval()

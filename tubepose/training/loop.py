@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-import pickle
 import warnings
-import zipfile
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -21,11 +19,13 @@ from tubepose.errors import DetectorError
 from tubepose.report import write_aside
 from tubepose.training.augmentation import Views, draw_sample
 from tubepose.training.network import build_network
+from tubepose.training.start import CHECKPOINT, MODEL_SUFFIX, load_start, match_statistics
 
 if TYPE_CHECKING:
     import torch
 
-CHECKPOINT = "checkpoint.pt"
+_STATISTICS_BATCHES = 8
+"""Batches whose statistics a start from a model's file takes over."""
 _LOSSES = ("total_loss", "iou_loss", "conf_loss", "cls_loss")
 
 
@@ -86,7 +86,7 @@ class Trainer:
             files: Pictures to learn from.
             folder: Where the checkpoint is.
             threads: Processor threads.
-            start: Checkpoint of another training, whose averaged weights this one starts from.
+            start: Checkpoint of another training, whose averaged weights this one starts from, or a model of one.
 
         Raises:
             DetectorError: A package is missing, a checkpoint is of another recipe or other classes, or `start` is none.
@@ -100,8 +100,11 @@ class Trainer:
         self.device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
         network = build_network(len(files.classes), pretrained=recipe.pretrained and start is None)
         if start is not None:
-            _load_average(network, start)
+            load_start(network, start, files.classes)
         self.network = network.to(self.device, memory_format=torch.channels_last)
+        resumed = (folder / CHECKPOINT).is_file()
+        if start is not None and start.suffix == MODEL_SUFFIX and not resumed:
+            self._match_statistics()
         _freeze(self.network, recipe.frozen_blocks)
         self.optimizer = torch.optim.AdamW(_groups(self.network, recipe), lr=recipe.rate)
         self.average = torch.optim.swa_utils.AveragedModel(
@@ -109,8 +112,19 @@ class Trainer:
         )
         self.step = 0
         self.losses: list[list[float]] = []
-        if (folder / CHECKPOINT).is_file():
+        if resumed:
             self._resume(folder / CHECKPOINT)
+
+    def _match_statistics(self) -> None:
+        """Normalise by what this training's own batches are like: a model's file has no statistics of its own."""
+        _train_mode(self.network)
+        match_statistics(self.network, (self._images(self.batch(step)[0]) for step in range(_STATISTICS_BATCHES)))
+
+    def _images(self, images: NDArray[np.uint8]) -> torch.Tensor:
+        import torch
+
+        tensor = torch.from_numpy(images).to(self.device, torch.float32)
+        return tensor.contiguous(memory_format=torch.channels_last)
 
     def _blend(self, mean: torch.Tensor, value: torch.Tensor, count: torch.Tensor | int) -> torch.Tensor:
         share = min(self.recipe.average, (1.0 + int(count)) / (10.0 + int(count)))
@@ -163,10 +177,9 @@ class Trainer:
         rate = self.recipe.rate * _schedule(self.step, self.recipe.steps)
         for group in self.optimizer.param_groups:
             group["lr"] = rate * group["share"]
-        tensor = torch.from_numpy(images).to(self.device, torch.float32).contiguous(memory_format=torch.channels_last)
         with warnings.catch_warnings():  # YOLOX calls autocast by its old name
             warnings.simplefilter("ignore", FutureWarning)
-            found = self.network(tensor, torch.from_numpy(labels).to(self.device))
+            found = self.network(self._images(images), torch.from_numpy(labels).to(self.device))
         self.optimizer.zero_grad(set_to_none=True)
         found["total_loss"].backward()
         torch.nn.utils.clip_grad_norm_(self.network.parameters(), 10.0)
@@ -204,23 +217,6 @@ class Trainer:
         self.average.load_state_dict(state["average"])
         self.optimizer.load_state_dict(state["optimizer"])
         self.step, self.losses = state["step"], state["losses"]
-
-
-def _load_average(network: torch.nn.Module, start: Path) -> None:
-    import torch
-
-    try:
-        if not zipfile.is_zipfile(start):
-            raise ValueError("no file of PyTorch")
-        state = torch.load(start, map_location="cpu", weights_only=True)["average"]
-        network.load_state_dict(
-            {name.removeprefix("module."): value for name, value in state.items() if name.startswith("module.")}
-        )
-    except (OSError, KeyError, TypeError, ValueError, RuntimeError, pickle.UnpicklingError) as problem:
-        what = " ".join(str(problem).split())[:120]
-        raise DetectorError(
-            f"{start}: no checkpoint to start from ({what}); expected {CHECKPOINT} of a training with as many classes"
-        ) from None
 
 
 def _freeze(network: torch.nn.Module, blocks: int) -> None:

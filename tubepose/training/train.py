@@ -43,7 +43,7 @@ class TrainingJob:
         recipe: How to train.
         looks: How large the trained network is to see whole pictures and racks.
         threads: Processor threads.
-        start: Checkpoint of another training to start from; None for the photographs' weights alone.
+        start: Checkpoint or model of another training to start from; None for the photographs' weights alone.
     """
 
     files: LabelledFiles
