@@ -1,4 +1,4 @@
-"""What several test files share: one small simulated session per run."""
+"""What all tests share: no example is timed, as machines differ. What several share: one small simulated session."""
 
 from __future__ import annotations
 
@@ -6,6 +6,10 @@ from pathlib import Path
 
 import pytest
 from commands import tubepose
+from hypothesis import settings
+
+settings.register_profile("untimed", deadline=None)
+settings.load_profile("untimed")
 
 SMALL_RACK = "round-10ml-3x4"
 SMALL_TUBES = ("blood-16x100", "chen2023-tube-3")

@@ -125,7 +125,7 @@ _ORDERS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
 _KINDS = {"float": "f4", "double": "f8", "short": "i2", "uchar": "u1", "int32": "i4"}
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(
     order=st.sampled_from(sorted(_ORDERS)),
     coordinate=st.sampled_from(["float", "double"]),

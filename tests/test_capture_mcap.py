@@ -119,7 +119,7 @@ def test_same_frames_give_same_bytes_and_nothing_partial(tmp_path, compressed):
 # Layouts -------------------------------------------------------------------------------------------------------------
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(
     height=st.integers(1, 4),
     width=st.integers(1, 5),
@@ -309,7 +309,7 @@ def test_the_raw_depth_goes_before_its_compressed_twin(tmp_path):
     np.testing.assert_allclose(frame.cloud_m[..., 2], 0.5, atol=1e-4)
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(
     near=st.floats(0.35, 1.1),
     span=st.floats(0, 0.75),
@@ -547,7 +547,7 @@ def test_cut_file_gives_its_whole_frames_and_then_the_error(tmp_path, keep):
         np.testing.assert_allclose(frame.cloud_m, make_frame().cloud_m, atol=1e-7)
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(keep=st.floats(0, 1))
 def test_file_cut_anywhere_ends_in_one_clear_error(tmp_path_factory, keep):
     path = tmp_path_factory.mktemp("cut") / "a.mcap"

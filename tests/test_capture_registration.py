@@ -28,7 +28,7 @@ def test_points_outside_behind_and_invalid_are_left_out():
     assert np.isnan(project_cloud(points, np.eye(4), CAMERA)).all()
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 @given(seed=st.integers(0, 1000), x=st.floats(-0.3, 0.3), y=st.floats(-0.3, 0.3))
 def test_projection_undoes_the_place_of_the_sensor(seed, x, y):
     rng = np.random.default_rng(seed)
@@ -39,7 +39,7 @@ def test_projection_undoes_the_place_of_the_sensor(seed, x, y):
     np.testing.assert_allclose(organised, cloud, atol=1e-9)
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 @given(
     fx=st.floats(100, 3000),
     fy=st.floats(100, 3000),

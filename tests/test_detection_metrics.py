@@ -60,7 +60,7 @@ def test_loose_boxes_count_at_half_an_overlap_and_not_at_more():
     assert found.ap50_95 == pytest.approx(0.5)
 
 
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=50)
 @given(st.integers(0, 2**32 - 1))
 def test_average_precision_does_not_depend_on_order_and_only_grows_with_a_right_answer(seed):
     rng = np.random.default_rng(seed)

@@ -80,7 +80,7 @@ spins = st.floats(-360, 360)
 
 
 @given(x_deg=angles, y_deg=angles, spin_deg=spins)
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=100)
 def test_swing_gives_back_the_rotation_vector_for_any_spin(x_deg, y_deg, spin_deg):
     found = one(CAMERA, CAMERA @ turned(x_deg, y_deg, spin_deg))
     assert (found.rx_deg[0], found.ry_deg[0]) == pytest.approx((x_deg, y_deg), abs=1e-6)
@@ -88,7 +88,7 @@ def test_swing_gives_back_the_rotation_vector_for_any_spin(x_deg, y_deg, spin_de
 
 
 @given(spin_deg=spins, x_deg=angles)
-@settings(max_examples=10, deadline=None)
+@settings(max_examples=10)
 def test_surface_distances_do_not_see_the_spin(spin_deg, x_deg):
     plain, spun = CAMERA @ turned(x_deg, 1.0, 0.0, (1, 2, 3)), CAMERA @ turned(x_deg, 1.0, spin_deg, (1, 2, 3))
     for distance in (mssd_mm, add_s_mm):

@@ -290,7 +290,7 @@ def test_a_file_of_another_kind_is_refused(tmp_path: Path) -> None:
         load_tube(str(written(tmp_path, TEN_LINES)))
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(
     st.recursive(
         st.none() | st.booleans() | st.integers() | st.text(max_size=5),

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from test_profile_rims import CAMERA, INNER_M, LEVEL_M, OUTER_M, RACK, VIEW, drawn, frame_of, level_points
+from test_profile_rims import CAMERA, INNER_M, LEVEL_M, OUTER_M, RACK, VIEW, drawn, frame_of, level_points, seen
 
 from tubepose.config import Config, ProfileConfig
 from tubepose.labware import load_tube
@@ -28,9 +28,9 @@ NOTHING = Standing(np.empty((0, 3)), invert_transform(VIEW)[:3, 3])
 
 def look(image, centers_m=CENTERS_M, blocked_at=free, config=CONFIG, standing=NOTHING):
     search = RimSearch(
-        CAMERA, VIEW, centers_m, REACH_M, LEVEL_M, np.array([INNER_M, OUTER_M]), blocked_at, standing, config
+        seen(image), centers_m, REACH_M, LEVEL_M, np.array([INNER_M, OUTER_M]), blocked_at, standing, config
     )
-    return find_faint_rims(frame_of(image), search)
+    return find_faint_rims(search)
 
 
 @pytest.mark.parametrize("shift_mm", [(0.0, 0.0), (3.5, -1.0), (-2.0, 3.0)])

@@ -131,6 +131,11 @@ def test_a_direction_votes_for_brighter_than_both_sides():
     picture[tuple((ring + 10).T)] = (150, 150, 150, 20)  # three directions brighter, one darker
     shifts = np.array([[0, 0], [1, 1]])
     votes, best = fit_kernels.ring_votes(picture, np.array([[10, 10], [9, 9], [0, 0]]), shifts, ring, *beside, 1e-6)
-    assert votes[:2] == pytest.approx((0.5, 0.5))
-    assert best[:2].tolist() == [0, 1]
-    assert votes[2] < 0.5  # half of the directions lie beyond the picture: they have no vote
+    assert votes[:2, 0] == pytest.approx((0.5, 0.5))
+    assert best[:2, 0].tolist() == [0, 1]
+    assert votes[2, 0] < 0.5  # half of the directions lie beyond the picture: they have no vote
+    dark, where = fit_kernels.ring_votes(150 - picture, np.array([[9, 9]]), shifts, ring, *beside, 1e-6)
+    assert (dark[0, 1], where[0, 1]) == (pytest.approx(0.5), 1)  # the same ring, darker
+    picture[tuple(ring[:2].T + 10)] = np.nan  # nothing is known there
+    votes, _ = fit_kernels.ring_votes(picture, np.array([[10, 10]]), shifts[:1], ring, *beside, 1e-6)
+    assert votes[0, 0] == pytest.approx(0.0, abs=1e-6)  # one for, one against

@@ -99,7 +99,7 @@ def test_nothing_to_see_is_unknown():
     assert np.isfinite(found.covariance_m2).all()
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(
     x=st.floats(-0.8, 0.8),
     y=st.floats(-0.8, 0.8),
@@ -119,7 +119,7 @@ def test_exact_ends_give_exact_circles(x, y, widening, missing, start):
     assert np.all(np.linalg.eigvalsh(found.covariance_m2[0]) > 0)
 
 
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=20)
 @given(seed=st.integers(0, 10_000), turn=st.integers(0, SECTORS - 1))
 def test_turning_the_sectors_turns_the_offset(seed, turn):
     excess = np.random.default_rng(seed).normal(0, 2e-4, (1, SECTORS))

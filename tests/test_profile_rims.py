@@ -8,7 +8,7 @@ from tubepose.capture.frame import CameraIntrinsics, RgbdFrame
 from tubepose.config import ProfileConfig
 from tubepose.labware import load_rack
 from tubepose.profile.outline import SECTORS
-from tubepose.profile.rims import brightness, fit_rims
+from tubepose.profile.rims import brightness, fit_rims, rim_view
 
 CONFIG = ProfileConfig()
 RACK = load_rack("chen2023-soft-5x10")
@@ -54,10 +54,14 @@ def fit(frame, T, start_m, blocked=NONE_BLOCKED, level_m=LEVEL_M):
     start = np.atleast_2d(start_m)
     count = len(start)
     radii = np.tile([INNER_M, OUTER_M], (count, 1))
-    return start + fit_rims(frame, CAMERA, T, start, np.full(count, level_m), radii, blocked, CONFIG).offset_m
+    return start + fit_rims(rim_view(frame, CAMERA, T), start, np.full(count, level_m), radii, blocked, CONFIG).offset_m
 
 
 VIEW = scenes.camera_from_rack(RACK, 0.4, 0.12, 0.6)
+
+
+def seen(image):
+    return rim_view(frame_of(image), CAMERA, VIEW)
 
 
 @pytest.mark.parametrize("off_mm", [(0.0, 0.0), (1.1, -0.9), (-0.2, 1.4)])
@@ -95,7 +99,7 @@ def test_half_a_ring_is_enough_and_blocked_sectors_do_not_count():
     blocked = NONE_BLOCKED.copy()
     blocked[0, :8] = True
     radii = np.array([[INNER_M, OUTER_M]])
-    found = fit_rims(frame_of(image), CAMERA, VIEW, center[None] + 5e-4, np.array([LEVEL_M]), radii, blocked, CONFIG)
+    found = fit_rims(seen(image), center[None] + 5e-4, np.array([LEVEL_M]), radii, blocked, CONFIG)
     assert found.sectors[0] == pytest.approx(16 / 24, abs=0.05)
     assert center + 5e-4 + found.offset_m[0] == pytest.approx(center, abs=8e-5)
 
@@ -103,7 +107,7 @@ def test_half_a_ring_is_enough_and_blocked_sectors_do_not_count():
 def test_an_image_without_a_ring_has_no_sectors():
     radii = np.array([[INNER_M, OUTER_M]])
     flat = np.full((CAMERA.height, CAMERA.width), 90, np.uint8)
-    found = fit_rims(frame_of(flat), CAMERA, VIEW, np.zeros((1, 2)), np.array([LEVEL_M]), radii, NONE_BLOCKED, CONFIG)
+    found = fit_rims(seen(flat), np.zeros((1, 2)), np.array([LEVEL_M]), radii, NONE_BLOCKED, CONFIG)
     assert found.sectors[0] == 0
     assert np.isnan(found.offset_m).all()
 
@@ -113,9 +117,7 @@ def test_noise_alone_is_no_whole_ring():
     shares = []
     for seed in range(6):
         noise = np.random.default_rng(seed).integers(0, 255, (CAMERA.height, CAMERA.width)).astype(np.uint8)
-        found = fit_rims(
-            frame_of(noise), CAMERA, VIEW, np.zeros((1, 2)), np.array([LEVEL_M]), radii, NONE_BLOCKED, CONFIG
-        )
+        found = fit_rims(seen(noise), np.zeros((1, 2)), np.array([LEVEL_M]), radii, NONE_BLOCKED, CONFIG)
         shares.append(found.sectors[0])
     # Contrast is relative: sectors of noise pass one by one, but never all, and the ring is asked for points too.
     assert max(shares) < 0.95
@@ -131,16 +133,16 @@ def test_without_an_image_the_picture_of_depth_stands_for_it_with_less_trust():
     assert set(np.unique(brightness(bare))) == {0.0, 1.0}
     radii = np.array([[INNER_M, OUTER_M]])
     start, level = center[None] + [[5e-4, 3e-4]], np.array([LEVEL_M])
-    found = fit_rims(bare, CAMERA, VIEW, start, level, radii, NONE_BLOCKED, CONFIG)
+    found = fit_rims(rim_view(bare, CAMERA, VIEW), start, level, radii, NONE_BLOCKED, CONFIG)
     assert start[0] + found.offset_m[0] == pytest.approx(center, abs=8e-5)
-    sure = fit_rims(frame_of(drawn(VIEW, center)), CAMERA, VIEW, start, level, radii, NONE_BLOCKED, CONFIG)
+    sure = fit_rims(seen(drawn(VIEW, center)), start, level, radii, NONE_BLOCKED, CONFIG)
     assert np.trace(found.covariance_m2[0]) > np.trace(sure.covariance_m2[0])
 
 
 def test_a_rim_at_the_images_edge_does_not_fail():
     corner = level_points(VIEW)[0, 0]
     found = fit_rims(
-        frame_of(drawn(VIEW, corner)), CAMERA, VIEW, corner[None], np.array([LEVEL_M]),
+        seen(drawn(VIEW, corner)), corner[None], np.array([LEVEL_M]),
         np.array([[INNER_M, OUTER_M]]), NONE_BLOCKED, CONFIG,
     )  # fmt: skip
     assert found.sectors[0] < 0.75

@@ -254,7 +254,7 @@ detections = st.lists(
 
 
 @given(found=detections)
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=50)
 def test_both_formats_give_back_what_was_written(tmp_path_factory, found):
     folder = label_folder(tmp_path_factory.mktemp("round") / "labels")
     write_yolo_txt(folder / "original.txt", found, (WIDTH, HEIGHT), NAMES, with_scores=True)

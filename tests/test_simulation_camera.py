@@ -51,7 +51,7 @@ def test_a_level_plane_is_where_it_is():
     assert np.isnan(frame.cloud_m[~lit]).all()
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 @given(bits=st.integers(8, 14), amplitude=st.floats(0.1, 1.0), room=st.floats(0.0, 1.0))
 def test_quantisation_alone_moves_a_column_by_no_more_than_half_a_count_allows(bits, amplitude, room):
     noise = dataclasses.replace(NO_NOISE, bits=bits)

@@ -182,6 +182,16 @@ def test_an_unknown_height_is_told_with_the_expected_ones():
     assert reason == "unknown type: 90.0 mm high, expected (mm): chen2023-tube-2 100, chen2023-tube-3 105.5"
 
 
+def test_an_open_rim_may_seem_lower_than_it_is_and_a_cap_may_not():
+    def seen(tube, off_mm):
+        points = disc(center_mm("A1"), 8.0, z_mm=RACK.floor_mm + tube.height_mm + off_mm)
+        return identify_tube("tube", points, (tube,), RACK, CONFIG)[0]
+
+    assert seen(TUBE_1, -3.2) == TUBE_1
+    assert seen(TUBE_2, -3.2) is None
+    assert seen(TUBE_1, 3.2) is None
+
+
 def test_heights_that_are_alike_are_not_guessed():
     points = disc(center_mm("A1"), 8.0, z_mm=RACK.floor_mm + 106.5)  # 1.0 from one, 1.25 from the other
     tube, reason = identify_tube("tube", points, (TUBE_1, TUBE_2, TUBE_3), RACK, CONFIG)

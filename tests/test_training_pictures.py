@@ -119,7 +119,7 @@ def test_no_picture_to_train_on_has_a_held_out_ground():
         assert 0.0 <= picture.min() <= picture.max() <= 1.0
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 @given(st.integers(0, 2**32 - 1))
 def test_variants_are_labware_and_differ(seed):
     rng = np.random.default_rng(seed)
@@ -221,7 +221,7 @@ def red_square(tmp_path_factory):
     return labelled_set(folder)
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(seed=st.integers(0, 2**32 - 1), mosaic=st.sampled_from([0.0, 1.0]), rack_share=st.sampled_from([0.0, 1.0]))
 def test_boxes_stay_on_their_objects_in_samples(red_square, monkeypatch_module, seed, mosaic, rack_share):
     views = Views(whole_px=220, rack_px=60, rack_share=rack_share)

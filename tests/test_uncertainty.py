@@ -61,7 +61,7 @@ def test_each_axis_by_hand() -> None:
         assert square == pytest.approx(9, rel=1e-6)
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 @given(seed=st.integers(0, 10_000), spin=st.floats(-3.1, 3.1))
 def test_neither_the_camera_nor_the_truths_spin_changes_a_square(seed: int, spin: float) -> None:
     T, covariance, T_moved = pose_at(seed), covariance_of(seed), pose_at(seed + 1)
@@ -82,7 +82,7 @@ def test_without_a_pose_or_a_covariance_there_is_no_square() -> None:
 # Columns
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 @given(seed=st.integers(0, 10_000))
 def test_covariances_come_back_from_their_columns(seed: int) -> None:
     covariance = covariance_of(seed)

@@ -257,7 +257,7 @@ def test_tensor_is_rgb_to_one_or_bgr_to_255():
     centred=st.booleans(),
     corners=st.lists(st.floats(0, 1), min_size=4, max_size=4),
 )
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=200)
 def test_letterbox_keeps_inside_and_is_undone(image, net, centred, corners):
     box = fit_letterbox(image, net, centred=centred)
     edges = np.array([corners]) * np.tile(image, 2)

@@ -148,6 +148,7 @@ class SlotConfig(_Section):
         reach_m: How far beyond a tube's largest radius its points may lie from its slot's axis at the top: the lean.
         min_share: Smallest share of the projected hull's area for a slot to hold the tube.
         height_tolerance_m: Largest difference between the measured and the defined height of a tube type.
+        open_depth_m: How far below its height an open tube can be measured: light returns from below its rim.
     """
 
     top_band_m: float = 2.5e-3
@@ -155,6 +156,7 @@ class SlotConfig(_Section):
     reach_m: float = 4.0e-3
     min_share: float = 0.2
     height_tolerance_m: float = 2.5e-3
+    open_depth_m: float = 3.5e-3
 
 
 class TubeConfig(_Section):

@@ -20,7 +20,7 @@ from tubepose.config import RackConfig
 from tubepose.labware import RackModel
 from tubepose.rack_evidence import evidence_of
 from tubepose.rack_field import GRID_M, PICTURE_M, picture, top_field
-from tubepose.rack_fit import LEAST_POINTS, Fit, camera_place, label, top_frame
+from tubepose.rack_fit import LEAST_POINTS, Fit, RoughFit, camera_place, label, rack_frame, top_frame
 from tubepose.transforms import FloatArray
 
 # Half thickness of the layer that is judged: the standard deviation of heights, but at least that of a good sensor, and
@@ -101,7 +101,7 @@ def measure_agreement(points_m: FloatArray, fit: Fit, rack: RackModel, config: R
     spacing_m = _spacing(ribs[:, :2])
     scatter_m = float(1.4826 * np.median(np.abs(ribs[:, 2])))
     evidence, beside, step_m = evidence_of(seen, rack)
-    alike = min(1.0, (spacing_m / INDEPENDENT_M) ** 2)
+    alike = _alike(spacing_m)
     return Agreement(
         rmse_m=float(np.hypot(scatter_m, np.sqrt(np.mean(np.maximum(distance[near], 0) ** 2)))),
         fitness=float(np.mean(near)),
@@ -116,6 +116,20 @@ def measure_agreement(points_m: FloatArray, fit: Fit, rack: RackModel, config: R
         step_m=step_m,
         spacing_m=spacing_m,
     )
+
+
+def rough_evidence(points_m: FloatArray, rough: RoughFit, spacing_m: float, rack: RackModel) -> float:
+    """The evidence of a rough fit among points (N, 3), camera frame, that lie `spacing_m` apart."""
+    window_m = float(np.clip(rough.scatter_m, *JUDGED_M))
+    evidence, _, _ = evidence_of(
+        label(np.ascontiguousarray(points_m, float), rack_frame(rough, rack), rack, window_m), rack
+    )
+    return evidence * _alike(spacing_m)
+
+
+def _alike(spacing_m: float) -> float:
+    """For how many independent points one stands, at most 1."""
+    return min(1.0, (spacing_m / INDEPENDENT_M) ** 2)
 
 
 def _on_ribs(points_m: FloatArray, fit: Fit, rack: RackModel) -> FloatArray:

@@ -15,7 +15,7 @@ from tubepose.config import Config, RackConfig, RackTopConfig
 from tubepose.labware import RackModel
 from tubepose.preprocessing import point_spacing_m, thin
 from tubepose.rack_acceptance import outline_words, too_coarse
-from tubepose.rack_agreement import Agreement, contradiction, measure_agreement, outline_fits
+from tubepose.rack_agreement import Agreement, contradiction, measure_agreement, outline_fits, rough_evidence
 from tubepose.rack_evidence import likelier_step_m
 from tubepose.rack_field import top_field
 from tubepose.rack_fit import HOPELESS_SHARE, Fit, RoughFit, camera_place, rack_frame, refine, roughly, top_frame
@@ -29,8 +29,8 @@ SLOT_STEPS = 6
 NEAR_STEP_M = 4e-3
 # Places whose coarse picture agrees less than this, compared with one that was accepted, are no rivals of it.
 RIVAL_WORTH = 0.4
-
-
+# The fine rounds add no more than this to a pose's evidence.
+ROUGH_MARGIN = 1.05
 # Beside a coarse place: its own error, and what lies outside of a top.
 NEAR_M = 0.06
 
@@ -82,9 +82,11 @@ def best_registration(
 
     The first one that sees much of the top is taken: only where little is seen can another place look like the rack.
     Places that are worth much less than one that was accepted are not looked at, nor, if hardly a point contradicts it,
-    those on other level directions than its own; and no more than `most`.
+    those on other level directions than its own; and no more than `most`. Those that a rough look tells to be no rivals
+    of it are looked at no further.
     """
     found: list[Registration] = []
+    been: list[FloatArray] = []
     worth = 0.0
 
     def until_settled() -> Iterator[list[Band]]:
@@ -94,16 +96,21 @@ def best_registration(
                 return
 
     for hypothesis in islice(search(until_settled(), rack), most):
-        if hypothesis.worth < RIVAL_WORTH * worth or _known(hypothesis.T_camera_rack, found, rack):
+        if hypothesis.worth < RIVAL_WORTH * worth or _known(hypothesis.T_camera_rack, been, rack):
             continue
-        registration = register_at(points_m, hypothesis.T_camera_rack, rack, config.rack)
+        near_m, rough = _on_lattice(points_m, hypothesis.T_camera_rack, rack)
+        if _no_rival(near_m, rough, found, rack, config.rack):
+            been.append(rack_frame(rough, rack))
+            continue
+        registration = _settled(points_m, near_m, rough, rack, config.rack)
         if not registration.reason and _clear(registration, config.rack):
             return registration
         registration = _level(registration, hypothesis.level, config.rack)
         if not registration.reason:
             worth = max(worth, hypothesis.worth)
-        if not _known(registration.fit.T_camera_rack, found, rack):
+        if not _known(registration.fit.T_camera_rack, been, rack):
             found.append(registration)
+            been.append(registration.fit.T_camera_rack)
     return _likeliest(found, rack, config.rack)
 
 
@@ -130,8 +137,20 @@ def _likeliest(found: list[Registration], rack: RackModel, config: RackConfig) -
     return replace(found[0], reason=reason)
 
 
-def _known(T_camera_rack: FloatArray, found: list[Registration], rack: RackModel) -> bool:
-    return any(_same(T_camera_rack, other.fit.T_camera_rack, rack) for other in found)
+def _known(T_camera_rack: FloatArray, been: list[FloatArray], rack: RackModel) -> bool:
+    return any(_same(T_camera_rack, other, rack) for other in been)
+
+
+def _no_rival(
+    near_m: FloatArray, rough: RoughFit, found: list[Registration], rack: RackModel, config: RackConfig
+) -> bool:
+    """Whether a rough fit has too little evidence to be a rival of the best pose that was accepted before it."""
+    accepted = [other.agreement for other in found if not other.reason]
+    if not accepted:
+        return False
+    best = max(accepted, key=lambda agreement: agreement.evidence)
+    most = ROUGH_MARGIN * rough_evidence(near_m, rough, best.spacing_m, rack)
+    return most * config.min_rival_ratio < best.evidence
 
 
 def _level(registration: Registration, level: FloatArray, config: RackConfig) -> Registration:
@@ -172,7 +191,13 @@ def seen_near(points_m: FloatArray, T_camera_rack: FloatArray, rack: RackModel) 
 
 def register_at(points_m: FloatArray, T_camera_rack: FloatArray, rack: RackModel, config: RackConfig) -> Registration:
     """Refine a coarse pose and judge it; where one a slot farther has more evidence, go there first."""
-    near_m, rough = _on_lattice(points_m, T_camera_rack, rack)
+    return _settled(points_m, *_on_lattice(points_m, T_camera_rack, rack), rack, config)
+
+
+def _settled(
+    points_m: FloatArray, near_m: FloatArray, rough: RoughFit, rack: RackModel, config: RackConfig
+) -> Registration:
+    """The fine rounds and the judgement of a rough fit."""
     fit = refine(rough, rack)
     agreement = measure_agreement(near_m, fit, rack, config)
     for _ in range(SLOT_STEPS):

@@ -39,8 +39,11 @@ LEAST_SHARE = 0.12
 # Pictures of more than 1.6 m are not searched: no capture that shows ribs is as wide.
 MOST_CELLS = 800
 CLEAR_SHARE = 0.3
-# Points that a band's plane is fitted to, and free ones that a picture is made of.
+# Points that a band's plane is fitted to, those that they are chosen from, those that tell where a picture ends, and
+# free ones that it is made of.
 PLANE_POINTS = 2000
+ROUGH_POINTS = 6000
+ENDS_POINTS = 4000
 FREE_POINTS = 10_000
 
 
@@ -188,7 +191,8 @@ def _band(local_m: FloatArray, height: float, T_camera_level: FloatArray) -> Ban
     if len(rough) < 50:
         return None
     center, slope = _tilt(rough[:: len(rough) // PLANE_POINTS + 1])
-    near = rough[np.abs(rough[:, 2] - center[2] - (rough[:, :2] - center[:2]) @ slope) < BAND_M]
+    some = rough[:: len(rough) // ROUGH_POINTS + 1]
+    near = some[np.abs(some[:, 2] - center[2] - (some[:, :2] - center[:2]) @ slope) < BAND_M]
     if len(near) >= 50:
         center, slope = _tilt(near[:: len(near) // PLANE_POINTS + 1])
     if np.hypot(*slope) > np.tan(SAME_DIRECTION_RAD):
@@ -225,7 +229,7 @@ class Turn:
 
 def turns(band: Band, rack: RackModel, count: int) -> list[Turn]:
     """Angles of the rack's x axis in a band (modulo half a turn), the best first, by the strength of its waves."""
-    low, size = _frame(band.solid_m, rack, padded=False)
+    low, size = _frame(band.solid_m, np.eye(2), rack, padded=False)
     if size > MOST_CELLS:
         return []
     image = view_kernels.cell_counts(band.solid_m, np.eye(2), low, PICTURE_M, size)
@@ -240,8 +244,9 @@ def turns(band: Band, rack: RackModel, count: int) -> list[Turn]:
     return found
 
 
-def _frame(points_m: FloatArray, rack: RackModel, padded: bool) -> tuple[FloatArray, int]:
-    low, high = _ends(points_m)
+def _frame(points_m: FloatArray, turn: FloatArray, rack: RackModel, padded: bool) -> tuple[FloatArray, int]:
+    """First corner (2,), metres, and side in cells of a picture of points (N, 2), turned by a matrix from the right."""
+    low, high = _ends(points_m[:: len(points_m) // ENDS_POINTS + 1] @ turn)
     side = float((high - low).max()) + 10e-3
     if padded:
         side = max(side, float((high - low).max()) + 0.5 * float(np.hypot(*rack.outline_m)))
@@ -263,7 +268,7 @@ def place(turn: Turn, rack: RackModel) -> list[Hypothesis]:
     """Where the picture of the top lies best at one angle; for a top that half a turn changes, both ways round."""
     cos, sin = np.cos(turn.angle_rad), np.sin(turn.angle_rad)
     T_turned = np.array([[cos, -sin], [sin, cos]])
-    low, size = _frame(turn.band.solid_m @ T_turned, rack, padded=True)
+    low, size = _frame(turn.band.solid_m, T_turned, rack, padded=True)
     hits, misses = (
         view_kernels.cell_counts(places, T_turned, low, PICTURE_M, size)
         for places in (turn.band.solid_m, turn.band.free_m)

@@ -167,7 +167,9 @@ def identify_tube(
     height_m = float(np.percentile(points_m[:, 2], 95)) - rack.floor_m
     differences = [abs(tube.height_m - height_m) for tube in candidates]
     order = np.argsort(differences)
-    if differences[order[0]] > config.height_tolerance_m:
+    nearest = candidates[order[0]]
+    sunk = nearest.is_open and height_m < nearest.height_m
+    if differences[order[0]] > (config.open_depth_m if sunk else config.height_tolerance_m):
         heights = ", ".join(f"{tube.name} {tube.height_mm:g}" for tube in candidates)
         return None, f"unknown type: {height_m * 1e3:.1f} mm high, expected (mm): {heights}"
     if len(candidates) > 1 and differences[order[1]] - differences[order[0]] < 0.4 * config.height_tolerance_m:

@@ -11,17 +11,16 @@ knows of the other: the votes see whether a side is brighter and not by how much
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from tubepose.capture.frame import CameraIntrinsics, RgbdFrame
 from tubepose.config import ProfileConfig
 from tubepose.profile.fit_kernels import ring_heights, ring_votes
 from tubepose.profile.outline import SECTORS, Circles, unknown_circles
-from tubepose.profile.rims import brightness, fit_rims, ring_contrast
+from tubepose.profile.rims import RimView, fit_rims, ring_contrast
 from tubepose.profile.standing import Standing
 from tubepose.transforms import FloatArray
 
@@ -68,8 +67,7 @@ class RimSearch:
     """Where rims are looked for, and what they have to be.
 
     Attributes:
-        intrinsics: Of the frame's image.
-        T_camera_rack: The rack's pose, shape (4, 4), metres.
+        view: The image, and where the rack is in it.
         center_m: Middles of the slots, rack frame, shape (S, 2), metres.
         reach_m: How far from there a rim's middle can be, metres.
         level_m: Height of the rims above the rack's base.
@@ -79,8 +77,7 @@ class RimSearch:
         config: Limits, and noise of outlines.
     """
 
-    intrinsics: CameraIntrinsics
-    T_camera_rack: FloatArray
+    view: RimView
     center_m: FloatArray
     reach_m: float
     level_m: float
@@ -90,29 +87,28 @@ class RimSearch:
     config: ProfileConfig
 
 
-def find_faint_rims(frame: RgbdFrame, search: RimSearch) -> FaintRims:
-    """Look for a rim in each of some slots of a frame that is organised and has an image."""
-    assert frame.image is not None
-    negative = replace(frame, image=np.max(frame.image) - frame.image)
-    bright, dark = (_bright_rims(one, search) for one in (frame, negative))
+def find_faint_rims(search: RimSearch) -> FaintRims:
+    """Look for a rim, bright or dark, in each of some slots."""
+    bright, dark = (
+        _measured(place, votes, search, is_dark) for is_dark, (place, votes) in enumerate(_likeliest(search))
+    )
     return bright.where(bright.contrast >= dark.contrast, dark)
 
 
-def _bright_rims(frame: RgbdFrame, search: RimSearch) -> FaintRims:
-    """`find_faint_rims` for rings that are brighter than both of their sides."""
-    middle, votes = _likeliest(frame, search)
+def _measured(middle: FloatArray, votes: FloatArray, search: RimSearch, is_dark: int) -> FaintRims:
+    """Rings of one kind about middles (S, 2) that won enough votes (S,), measured and judged."""
     circles, contrast = unknown_circles(len(middle)), np.full(len(middle), -np.inf)
     at = np.flatnonzero(votes >= search.config.min_ring_votes)
     if len(at) == 0:
         return FaintRims(middle, circles, contrast)
-    view = (frame, search.intrinsics, search.T_camera_rack)
+    view = search.view.negative() if is_dark else search.view
     size = (np.full(len(at), search.level_m), np.tile(search.radii_m, (len(at), 1)))
-    found = fit_rims(*view, middle[at], *size, search.blocked_at(middle[at]), search.config)
+    found = fit_rims(view, middle[at], *size, search.blocked_at(middle[at]), search.config)
     place = middle[at] + np.nan_to_num(found.offset_m)
     blocked = search.blocked_at(place)
     seen = np.isfinite(found.offset_m[:, 0]) & ((~blocked).mean(axis=1) >= LEAST_FREE)
     seen &= ~_at_another_height(place, search)
-    contrast[at] = np.where(seen, ring_contrast(*view, place, *size, blocked), -np.inf)
+    contrast[at] = np.where(seen, ring_contrast(view, place, *size, blocked), -np.inf)
     return FaintRims(middle, circles.put(at, found), contrast)
 
 
@@ -139,23 +135,26 @@ def _at_another_height(center_m: FloatArray, search: RimSearch) -> NDArray[np.bo
     return np.asarray(one_height & ((most > 0).mean(axis=1) >= ALL_AROUND) & ~expected)
 
 
-def _likeliest(frame: RgbdFrame, search: RimSearch) -> tuple[FloatArray, FloatArray]:
-    """Place of each slot that wins most votes, shape (S, 2), metres, and those votes, -1 to 1, shape (S,)."""
+def _likeliest(search: RimSearch) -> list[tuple[FloatArray, FloatArray]]:
+    """Place of each slot with most votes, (S, 2), metres, and the votes, (S,), -1 to 1: for bright, then dark rings."""
     low, high = search.center_m.min(axis=0) - EDGE_M, search.center_m.max(axis=0) + EDGE_M
-    picture = _laid_out(frame, search.intrinsics, search.T_camera_rack, low, high, search.level_m)
+    picture = _laid_out(search.view, low, high, search.level_m)
     angles = (np.arange(DIRECTIONS) + 0.5) * (2 * np.pi / DIRECTIONS)
     around = np.column_stack([np.cos(angles), np.sin(angles)])
     middle_m, width_m = float(np.mean(search.radii_m)), float(np.ptp(search.radii_m))
     ring, inside, outside = (
         np.rint((middle_m + step) / CELL_M * around).astype(np.intp) for step in (0.0, -width_m, width_m)
     )
-    least = LEAST_GRAY * float(np.ptp(picture)) + 1e-6
-    cells = np.rint((search.center_m - low) / CELL_M).astype(np.intp)
-    votes = np.empty(len(cells))
-    for shifts in (_disc(search.reach_m, COARSE), _disc(COARSE * CELL_M, 1)):
-        votes, best = ring_votes(picture, cells, shifts, ring, inside, outside, least)
-        cells = cells + shifts[best]
-    return low + cells * CELL_M, votes
+    circles = (ring, inside, outside, LEAST_GRAY * float(np.nanmax(picture) - np.nanmin(picture)) + 1e-6)
+    middle, near = _disc(search.reach_m, COARSE), _disc(COARSE * CELL_M, 1)
+    start = np.rint((search.center_m - low) / CELL_M).astype(np.intp)
+    _, best = ring_votes(picture, start, middle, *circles)
+    found = []
+    for kind in range(2):
+        cells = start + middle[best[:, kind]]
+        votes, better = ring_votes(picture, cells, near, *circles)
+        found.append((low + (cells + near[better[:, kind]]) * CELL_M, votes[:, kind]))
+    return found
 
 
 def _disc(reach_m: float, step: int) -> NDArray[np.intp]:
@@ -165,20 +164,20 @@ def _disc(reach_m: float, step: int) -> NDArray[np.intp]:
     return np.asarray(cells[np.hypot(*cells.T) * CELL_M <= reach_m + 1e-9], np.intp)
 
 
-def _laid_out(
-    frame: RgbdFrame,
-    intrinsics: CameraIntrinsics,
-    T_camera_rack: FloatArray,
-    low_m: FloatArray,
-    high_m: FloatArray,
-    level_m: float,
-) -> NDArray[np.float32]:
-    """The image on a level of the rack, cells (X, Y) of `CELL_M`, the first at `low_m`; what is not seen is black."""
+def _laid_out(view: RimView, low_m: FloatArray, high_m: FloatArray, level_m: float) -> NDArray[np.float32]:
+    """The image on a level of the rack, cells (X, Y) of `CELL_M`, the first at `low_m`; NaN where it ends."""
     rows, columns = (int(cells) for cells in np.ceil((high_m - low_m) / CELL_M) + 1)
-    R, t = T_camera_rack[:3, :3], T_camera_rack[:3, 3]
-    K = np.array([[intrinsics.fx, 0, intrinsics.cx], [0, intrinsics.fy, intrinsics.cy], [0, 0, 1.0]])
+    lens, R, t = view.intrinsics, view.T_camera_rack[:3, :3], view.T_camera_rack[:3, 3]
+    K = np.array([[lens.fx, 0, lens.cx], [0, lens.fy, lens.cy], [0, 0, 1.0]])
     # A column of the picture goes along the rack's y, a row along its x.
     to_camera = np.column_stack([R[:, 1] * CELL_M, R[:, 0] * CELL_M, R @ [*low_m, level_m] + t])
-    source = np.asarray(brightness(frame), np.float32)
-    flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
-    return np.asarray(cv2.warpPerspective(source, K @ to_camera, (columns, rows), flags=flags), np.float32)
+    return np.asarray(
+        cv2.warpPerspective(
+            np.asarray(view.picture, np.float32),
+            K @ to_camera,
+            (columns, rows),
+            flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP,
+            borderValue=float("nan"),
+        ),
+        np.float32,
+    )

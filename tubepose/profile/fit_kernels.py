@@ -182,13 +182,13 @@ def wall_sums(residual_m, normal, above_m, of, pose, weight, near_m):
 
 @compiled
 def ring_votes(picture, cells, shifts, ring, inside, outside, least):
-    """Most votes (S,) for a bright ring about cells (S, 2), and with which of the shifts (M, 2) of its middle, (S,).
+    """Most votes (S, 2) for a bright and for a dark ring about cells (S, 2), and with which of the shifts (M, 2) each.
 
     `ring`, `inside` and `outside` are cells (D, 2) of directions from a middle. A direction votes by how much brighter
     its cell on the ring is than the two beside it, over their differences, a least one included: 1 if it is brighter
-    than both, -1 if darker, near 0 on an edge. Nothing is read outside of the picture.
+    than both, -1 if darker, near 0 on an edge. Directions that leave the picture, or meet a NaN, do not vote.
     """
-    votes, best = np.full(len(cells), -1.0), np.zeros(len(cells), np.intp)
+    votes, best = np.full((len(cells), 2), -1.0), np.zeros((len(cells), 2), np.intp)
     height, width = picture.shape
     for s in range(len(cells)):
         for m in range(len(shifts)):
@@ -200,9 +200,14 @@ def ring_votes(picture, cells, shifts, ring, inside, outside, least):
                 middle = picture[i + ring[d, 0], j + ring[d, 1]]
                 inner = middle - picture[i + inside[d, 0], j + inside[d, 1]]
                 outer = middle - picture[i + outside[d, 0], j + outside[d, 1]]
-                total += (inner + outer) / (abs(inner) + abs(outer) + least)
-            if total > votes[s] * len(ring):
-                votes[s], best[s] = total / len(ring), m
+                vote = (inner + outer) / (abs(inner) + abs(outer) + least)
+                if vote == vote:
+                    total += vote
+            share = total / len(ring)
+            if share > votes[s, 0]:
+                votes[s, 0], best[s, 0] = share, m
+            if -share > votes[s, 1]:
+                votes[s, 1], best[s, 1] = -share, m
     return votes, best
 
 

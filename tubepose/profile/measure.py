@@ -16,7 +16,7 @@ from tubepose.profile.faint_rims import RimSearch, find_faint_rims
 from tubepose.profile.kernels import cell_values, ends_on_planes, near_planes, nearest_tops
 from tubepose.profile.outline import NORMALS, OUTLINE_DEPTH_M, SECTORS, Circles, fit_discs, unknown_circles
 from tubepose.profile.plane import TopPlanes, fit_top_planes
-from tubepose.profile.rims import fit_rims
+from tubepose.profile.rims import RimView, fit_rims, rim_view
 from tubepose.profile.standing import Standing, gather_standing
 from tubepose.profile.tops import (
     Tops,
@@ -91,17 +91,18 @@ def measure_tops(
     standing = gather_standing(frame, intrinsics, T_camera_rack, rack, lowest_m, highest_m)
     tops = find_tops(standing, rack, tubes, config.profile, allowed)
     shape = _shapes(tops, tubes, rack)
-    rims = _measure_rims(frame, intrinsics, T_camera_rack, tops, shape, config.profile)
+    # Without pixels, or without knowing where they look, rims are not measured.
+    has_rims = any(tube.is_open for tube in tubes) and frame.organised
+    view = rim_view(frame, intrinsics, T_camera_rack) if has_rims and intrinsics is not None else None
+    rims = _measure_rims(view, tops, shape, config.profile)
     # A rim of clear plastic has few points, and other things look like one in the image: both must speak for it. Points
     # that make a ring are told of without the image too, to say that something stands there.
     alone = np.where(np.isfinite(rims.widening_m), RING_SUPPORT, config.profile.min_support)
     kept = ~shape.open | (tops.support > alone)
     kept |= rims.sectors * tops.support >= config.profile.min_rim_evidence
     tops, rims = tops.take(kept), rims.take(kept)
-    if frame.image is not None and frame.organised and intrinsics is not None:
-        tops, rims = _with_faint_rims(
-            frame, intrinsics, T_camera_rack, tops, rims, standing, rack, tubes, config.profile, allowed
-        )
+    if view is not None and view.is_image:
+        tops, rims = _with_faint_rims(view, tops, rims, standing, rack, tubes, config.profile, allowed)
     shape = _shapes(tops, tubes, rack)
     label = label_points(standing, tops.center_m, shape.radius_m)
     planes, discs = _measure_closed(standing, label, tops, shape, config.profile)
@@ -127,30 +128,21 @@ def _shapes(tops: Tops, tubes: Sequence[TubeModel], rack: RackModel) -> _Shapes:
     return _Shapes(of_type[:, 0], of_type[:, 1], of_type[:, 2], of_type[:, 3] > 0)
 
 
-def _measure_rims(
-    frame: RgbdFrame,
-    intrinsics: CameraIntrinsics | None,
-    T_camera_rack: FloatArray,
-    tops: Tops,
-    shape: _Shapes,
-    config: ProfileConfig,
-) -> Circles:
-    """Circles of the open tops; unknown for the others, and for all without pixels."""
+def _measure_rims(view: RimView | None, tops: Tops, shape: _Shapes, config: ProfileConfig) -> Circles:
+    """Circles of the open tops; unknown for the others, and for all without a view."""
     circles = unknown_circles(len(shape.open))
     at = np.flatnonzero(shape.open)
-    if len(at) == 0 or intrinsics is None or not frame.organised:
+    if len(at) == 0 or view is None:
         return circles
     radii = np.column_stack([shape.mouth_m, shape.radius_m])[at]
     sure = tops.support >= config.min_support
     blocked = blocked_sectors(tops.center_m, shape.radius_m, RIM_GAP_M, sure)[at]
-    rims = fit_rims(frame, intrinsics, T_camera_rack, tops.center_m[at], shape.level_m[at], radii, blocked, config)
+    rims = fit_rims(view, tops.center_m[at], shape.level_m[at], radii, blocked, config)
     return circles.put(at, rims)
 
 
 def _with_faint_rims(
-    frame: RgbdFrame,
-    intrinsics: CameraIntrinsics,
-    T_camera_rack: FloatArray,
+    view: RimView,
     tops: Tops,
     rims: Circles,
     standing: Standing,
@@ -170,10 +162,10 @@ def _with_faint_rims(
         radii = np.array([mouth_radius_m(tube), top_radius_m(tube)])
         reach_m = max(top_reach_m(rack.all_slots[i], tube, rack) for i in free)
         search = RimSearch(
-            intrinsics, T_camera_rack, rack.slot_centers_m[free], reach_m, top_level_m(tube, rack), radii,
+            view, rack.slot_centers_m[free], reach_m, top_level_m(tube, rack), radii,
             partial(_blocked_by, *known, float(radii[1])), standing, config,
         )  # fmt: skip
-        seen.append(find_faint_rims(frame, search))
+        seen.append(find_faint_rims(search))
     contrast = np.stack([one.contrast for one in seen])
     if allowed is not None:
         contrast = np.where(allowed[np.ix_(types, free)], contrast, -np.inf)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass, replace
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -25,41 +27,61 @@ MIN_CONTRAST = 0.35
 """Correlation of a sector's brightness with a ring's, below which the sector does not count."""
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class RimView:
+    """What rims are looked at in.
+
+    Attributes:
+        picture: Gray values, shape (H, W); without an image 1 and 0 for pixels with and without depth.
+        is_image: Whether it has one.
+        intrinsics: Of its image.
+        T_camera_rack: The rack's pose, shape (4, 4), metres.
+    """
+
+    picture: NDArray[np.float32] | NDArray[np.uint8]
+    is_image: bool
+    intrinsics: CameraIntrinsics
+    T_camera_rack: FloatArray
+
+    def negative(self) -> RimView:
+        """The same with bright and dark changed: a dark ring is a bright one there."""
+        return replace(self, picture=np.subtract(self.picture.max(), self.picture))
+
+
+def rim_view(frame: RgbdFrame, intrinsics: CameraIntrinsics, T_camera_rack: FloatArray) -> RimView:
+    """How rims are seen in an organised frame whose rack has a pose (4, 4), metres."""
+    return RimView(brightness(frame), frame.image is not None, intrinsics, T_camera_rack)
+
+
 def fit_rims(
-    frame: RgbdFrame,
-    intrinsics: CameraIntrinsics,
-    T_camera_rack: FloatArray,
+    view: RimView,
     center_m: FloatArray,
     level_m: FloatArray,
     radii_m: FloatArray,
     blocked: NDArray[np.bool_],
     config: ProfileConfig,
 ) -> Circles:
-    """Middle of rims in the frame's image, or without one in the picture of where there is depth.
+    """Middle of rims in an image, or without one in the picture of where there is depth.
 
     For each sector of each rim the mean brightness over the radius is compared with that of a ring between the rim's
     two radii, moved inwards and outwards; the best move is the sector's radius.
 
     Args:
-        frame: The frame; organised.
-        intrinsics: Of its image.
-        T_camera_rack: The rack's pose, shape (4, 4), metres.
+        view: The picture, and where the rack is in it.
         center_m: Middle of each rim as known so far, rack frame, shape (T, 2), metres.
         level_m: Height of each rim above the rack's base, shape (T,).
         radii_m: Inner and outer radius of each rim, shape (T, 2).
         blocked: Sectors that another top is too near to, shape (T, SECTORS).
         config: Noise of outlines.
     """
-    picture = brightness(frame)
-    view = (picture, intrinsics, T_camera_rack)
-    profile, steps_m = _radial_profiles(*view, center_m, level_m, radii_m, WIDE_M)
+    profile, steps_m = _radial_profiles(view, center_m, level_m, radii_m, WIDE_M)
     moves_m, _, correlation = _ring_scores(profile, steps_m, radii_m, WIDE_M)
     shift = _whole_ring_shift(moves_m, correlation, blocked)
     circles: Circles | None = None
     # The picture of depth has no ring where depth is too deep: it is worth less.
-    bias_m = config.rim_bias_m if frame.image is not None else 3 * config.rim_bias_m
+    bias_m = config.rim_bias_m if view.is_image else 3 * config.rim_bias_m
     for _ in range(ROUNDS):
-        profile, steps_m = _radial_profiles(*view, center_m + shift, level_m, radii_m, SEARCH_M)
+        profile, steps_m = _radial_profiles(view, center_m + shift, level_m, radii_m, SEARCH_M)
         move_m, contrast = _ring_moves(*_ring_scores(profile, steps_m, radii_m, SEARCH_M))
         circles = fit_circles(move_m, (contrast > MIN_CONTRAST) & ~blocked, config, config.rim_noise_m, bias_m)
         shift = shift + np.nan_to_num(circles.offset_m)
@@ -69,20 +91,13 @@ def fit_rims(
 
 
 def ring_contrast(
-    frame: RgbdFrame,
-    intrinsics: CameraIntrinsics,
-    T_camera_rack: FloatArray,
-    center_m: FloatArray,
-    level_m: FloatArray,
-    radii_m: FloatArray,
-    blocked: NDArray[np.bool_],
+    view: RimView, center_m: FloatArray, level_m: FloatArray, radii_m: FloatArray, blocked: NDArray[np.bool_]
 ) -> FloatArray:
     """Mean correlation of the sectors of circles, known to `NEAR_RING_M`, with a ring's; shape (T,), -1 to 1.
 
     Arguments are those of `fit_rims`; sectors that are blocked do not count.
     """
-    view = (brightness(frame), intrinsics, T_camera_rack)
-    profile, steps_m = _radial_profiles(*view, center_m, level_m, radii_m, SEARCH_M)
+    profile, steps_m = _radial_profiles(view, center_m, level_m, radii_m, SEARCH_M)
     moves_m, _, correlation = _ring_scores(profile, steps_m, radii_m, SEARCH_M)
     near = correlation[:, :, np.abs(moves_m) <= NEAR_RING_M].max(axis=2)
     return np.asarray((near * ~blocked).sum(axis=1) / np.maximum((~blocked).sum(axis=1), 1))
@@ -96,13 +111,7 @@ def brightness(frame: RgbdFrame) -> NDArray[np.float32] | NDArray[np.uint8]:
 
 
 def _radial_profiles(
-    picture: NDArray[np.float32] | NDArray[np.uint8],
-    intrinsics: CameraIntrinsics,
-    T_camera_rack: FloatArray,
-    center_m: FloatArray,
-    level_m: FloatArray,
-    radii_m: FloatArray,
-    search_m: float,
+    view: RimView, center_m: FloatArray, level_m: FloatArray, radii_m: FloatArray, search_m: float
 ) -> tuple[FloatArray, FloatArray]:
     """Brightness of every rim by sector and radius, shape (T, SECTORS, B), and the radii off the ring's middle, (B,).
 
@@ -112,9 +121,10 @@ def _radial_profiles(
     # The ring's own width on both sides of it is its background.
     reach = search_m + float(np.ptp(radii_m, axis=1).max()) + BIN_M
     steps = np.arange(-reach, reach + BIN_M / 2, BIN_M)
-    camera = np.array([intrinsics.fx, intrinsics.fy, intrinsics.cx, intrinsics.cy])
-    R, t = np.ascontiguousarray(T_camera_rack[:3, :3]), np.ascontiguousarray(T_camera_rack[:3, 3])
-    values = radial_brightness(picture, camera, R, t, center_m, level_m, middle, steps, SECTORS, PER_SECTOR)
+    lens, T = view.intrinsics, view.T_camera_rack
+    camera = np.array([lens.fx, lens.fy, lens.cx, lens.cy])
+    R, t = np.ascontiguousarray(T[:3, :3]), np.ascontiguousarray(T[:3, 3])
+    values = radial_brightness(view.picture, camera, R, t, center_m, level_m, middle, steps, SECTORS, PER_SECTOR)
     return np.asarray(values), steps
 
 
