@@ -139,3 +139,13 @@ def test_a_direction_votes_for_brighter_than_both_sides():
     picture[tuple(ring[:2].T + 10)] = np.nan  # nothing is known there
     votes, _ = fit_kernels.ring_votes(picture, np.array([[10, 10]]), shifts[:1], ring, *beside, 1e-6)
     assert votes[0, 0] == pytest.approx(0.0, abs=1e-6)  # one for, one against
+
+
+def test_shifts_of_a_ring_are_scored_by_the_sectors_that_are_free():
+    rng = np.random.default_rng(5)
+    correlation, blocked = rng.uniform(-1, 1, (3, 8, 11)), rng.random((3, 8)) < 0.3
+    moved = rng.integers(0, 11, (7, 8))
+    found = fit_kernels.shift_scores(correlation, blocked, moved)
+    usable = np.where(blocked[..., None], 0.0, np.maximum(correlation, 0.0))
+    expected = np.stack([usable[:, np.arange(8), row].sum(axis=1) for row in moved], axis=1)
+    assert found == pytest.approx(expected)

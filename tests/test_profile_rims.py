@@ -11,6 +11,7 @@ from tubepose.profile.outline import SECTORS
 from tubepose.profile.rims import brightness, fit_rims, rim_view
 
 CONFIG = ProfileConfig()
+BIAS_M = CONFIG.rim_bias_m
 RACK = load_rack("chen2023-soft-5x10")
 CAMERA = CameraIntrinsics(640, 480, 1600.0, 1600.0, 319.5, 239.5)
 LEVEL_M = 0.12
@@ -54,7 +55,10 @@ def fit(frame, T, start_m, blocked=NONE_BLOCKED, level_m=LEVEL_M):
     start = np.atleast_2d(start_m)
     count = len(start)
     radii = np.tile([INNER_M, OUTER_M], (count, 1))
-    return start + fit_rims(rim_view(frame, CAMERA, T), start, np.full(count, level_m), radii, blocked, CONFIG).offset_m
+    return (
+        start
+        + fit_rims(rim_view(frame, CAMERA, T), start, np.full(count, level_m), radii, blocked, CONFIG, BIAS_M).offset_m
+    )
 
 
 VIEW = scenes.camera_from_rack(RACK, 0.4, 0.12, 0.6)
@@ -99,7 +103,7 @@ def test_half_a_ring_is_enough_and_blocked_sectors_do_not_count():
     blocked = NONE_BLOCKED.copy()
     blocked[0, :8] = True
     radii = np.array([[INNER_M, OUTER_M]])
-    found = fit_rims(seen(image), center[None] + 5e-4, np.array([LEVEL_M]), radii, blocked, CONFIG)
+    found = fit_rims(seen(image), center[None] + 5e-4, np.array([LEVEL_M]), radii, blocked, CONFIG, BIAS_M)
     assert found.sectors[0] == pytest.approx(16 / 24, abs=0.05)
     assert center + 5e-4 + found.offset_m[0] == pytest.approx(center, abs=8e-5)
 
@@ -107,7 +111,7 @@ def test_half_a_ring_is_enough_and_blocked_sectors_do_not_count():
 def test_an_image_without_a_ring_has_no_sectors():
     radii = np.array([[INNER_M, OUTER_M]])
     flat = np.full((CAMERA.height, CAMERA.width), 90, np.uint8)
-    found = fit_rims(seen(flat), np.zeros((1, 2)), np.array([LEVEL_M]), radii, NONE_BLOCKED, CONFIG)
+    found = fit_rims(seen(flat), np.zeros((1, 2)), np.array([LEVEL_M]), radii, NONE_BLOCKED, CONFIG, BIAS_M)
     assert found.sectors[0] == 0
     assert np.isnan(found.offset_m).all()
 
@@ -117,7 +121,7 @@ def test_noise_alone_is_no_whole_ring():
     shares = []
     for seed in range(6):
         noise = np.random.default_rng(seed).integers(0, 255, (CAMERA.height, CAMERA.width)).astype(np.uint8)
-        found = fit_rims(seen(noise), np.zeros((1, 2)), np.array([LEVEL_M]), radii, NONE_BLOCKED, CONFIG)
+        found = fit_rims(seen(noise), np.zeros((1, 2)), np.array([LEVEL_M]), radii, NONE_BLOCKED, CONFIG, BIAS_M)
         shares.append(found.sectors[0])
     # Contrast is relative: sectors of noise pass one by one, but never all, and the ring is asked for points too.
     assert max(shares) < 0.95
@@ -133,9 +137,9 @@ def test_without_an_image_the_picture_of_depth_stands_for_it_with_less_trust():
     assert set(np.unique(brightness(bare))) == {0.0, 1.0}
     radii = np.array([[INNER_M, OUTER_M]])
     start, level = center[None] + [[5e-4, 3e-4]], np.array([LEVEL_M])
-    found = fit_rims(rim_view(bare, CAMERA, VIEW), start, level, radii, NONE_BLOCKED, CONFIG)
+    found = fit_rims(rim_view(bare, CAMERA, VIEW), start, level, radii, NONE_BLOCKED, CONFIG, BIAS_M)
     assert start[0] + found.offset_m[0] == pytest.approx(center, abs=8e-5)
-    sure = fit_rims(seen(drawn(VIEW, center)), start, level, radii, NONE_BLOCKED, CONFIG)
+    sure = fit_rims(seen(drawn(VIEW, center)), start, level, radii, NONE_BLOCKED, CONFIG, BIAS_M)
     assert np.trace(found.covariance_m2[0]) > np.trace(sure.covariance_m2[0])
 
 
@@ -143,7 +147,7 @@ def test_a_rim_at_the_images_edge_does_not_fail():
     corner = level_points(VIEW)[0, 0]
     found = fit_rims(
         seen(drawn(VIEW, corner)), corner[None], np.array([LEVEL_M]),
-        np.array([[INNER_M, OUTER_M]]), NONE_BLOCKED, CONFIG,
+        np.array([[INNER_M, OUTER_M]]), NONE_BLOCKED, CONFIG, BIAS_M,
     )  # fmt: skip
     assert found.sectors[0] < 0.75
 

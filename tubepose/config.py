@@ -197,6 +197,8 @@ class ProfileConfig(_Section):
         outline_bias_m: Standard deviation of a circle's middle beyond what its sectors explain.
         rim_noise_m: As `outline_noise_m`, of the bright ring of a rim.
         rim_bias_m: As `outline_bias_m`, of the bright ring of a rim.
+        faint_rim_bias_m: The same of a rim that the image alone shows.
+        torn_rim_m: What is added to it, by the share of the ring's free sectors that do not look like one.
         wall_noise_m: Standard deviation of points on a wall that can be believed, a label's say.
         wall_radius_m: Standard deviation of a wall's radius.
         wall_redundancy: How many neighbouring points of a wall count as one: they share their error.
@@ -231,6 +233,8 @@ class ProfileConfig(_Section):
     widening_m: float = 3.0e-4
     rim_noise_m: float = 2.0e-4
     rim_bias_m: float = 5.0e-5
+    faint_rim_bias_m: float = 2.5e-4
+    torn_rim_m: float = 6.0e-4
     cap_height_m: float = 3.0e-4
     cap_tilt_rad: float = 0.0030
     wall_noise_m: float = 1.5e-4

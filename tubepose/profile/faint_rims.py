@@ -103,7 +103,9 @@ def _measured(middle: FloatArray, votes: FloatArray, search: RimSearch, is_dark:
         return FaintRims(middle, circles, contrast)
     view = search.view.negative() if is_dark else search.view
     size = (np.full(len(at), search.level_m), np.tile(search.radii_m, (len(at), 1)))
-    found = fit_rims(view, middle[at], *size, search.blocked_at(middle[at]), search.config)
+    found = fit_rims(
+        view, middle[at], *size, search.blocked_at(middle[at]), search.config, search.config.faint_rim_bias_m
+    )
     place = middle[at] + np.nan_to_num(found.offset_m)
     blocked = search.blocked_at(place)
     seen = np.isfinite(found.offset_m[:, 0]) & ((~blocked).mean(axis=1) >= LEAST_FREE)

@@ -212,6 +212,21 @@ def ring_votes(picture, cells, shifts, ring, inside, outside, least):
 
 
 @compiled
+def shift_scores(correlation, blocked, moved):
+    """Sums (T, K) of the correlations (T, S, M) that are above 0 over sectors that are not blocked (T, S).
+
+    `moved` (K, S) tells by which of the M moves each of K shifts of a ring moves each sector.
+    """
+    total = np.zeros((len(correlation), len(moved)))
+    for t in range(len(correlation)):
+        for s in range(correlation.shape[1]):
+            if not blocked[t, s]:
+                for k in range(len(moved)):
+                    total[t, k] += max(correlation[t, s, moved[k, s]], 0.0)
+    return total
+
+
+@compiled
 def ring_heights(points_m, camera_m, level_m, centers_m, inner_m, outer_m, low_m, bin_m, bins, sectors):
     """Points (T, B, sectors) that are seen on rings of a level, by height, in bins from `low_m` on, and direction."""
     counts = np.zeros((len(centers_m), bins, sectors), np.intp)

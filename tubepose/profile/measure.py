@@ -137,7 +137,7 @@ def _measure_rims(view: RimView | None, tops: Tops, shape: _Shapes, config: Prof
     radii = np.column_stack([shape.mouth_m, shape.radius_m])[at]
     sure = tops.support >= config.min_support
     blocked = blocked_sectors(tops.center_m, shape.radius_m, RIM_GAP_M, sure)[at]
-    rims = fit_rims(view, tops.center_m[at], shape.level_m[at], radii, blocked, config)
+    rims = fit_rims(view, tops.center_m[at], shape.level_m[at], radii, blocked, config, config.rim_bias_m)
     return circles.put(at, rims)
 
 

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from tubepose.capture.frame import CameraIntrinsics, RgbdFrame
 from tubepose.config import ProfileConfig
+from tubepose.profile.fit_kernels import shift_scores
 from tubepose.profile.kernels import radial_brightness
 from tubepose.profile.outline import NORMALS, SECTORS, Circles, fit_circles
 from tubepose.transforms import FloatArray
@@ -60,6 +61,7 @@ def fit_rims(
     radii_m: FloatArray,
     blocked: NDArray[np.bool_],
     config: ProfileConfig,
+    bias_m: float,
 ) -> Circles:
     """Middle of rims in an image, or without one in the picture of where there is depth.
 
@@ -73,13 +75,14 @@ def fit_rims(
         radii_m: Inner and outer radius of each rim, shape (T, 2).
         blocked: Sectors that another top is too near to, shape (T, SECTORS).
         config: Noise of outlines.
+        bias_m: Error of a whole rim's middle, along x and along y.
     """
     profile, steps_m = _radial_profiles(view, center_m, level_m, radii_m, WIDE_M)
     moves_m, _, correlation = _ring_scores(profile, steps_m, radii_m, WIDE_M)
     shift = _whole_ring_shift(moves_m, correlation, blocked)
     circles: Circles | None = None
-    # The picture of depth has no ring where depth is too deep: it is worth less.
-    bias_m = config.rim_bias_m if view.is_image else 3 * config.rim_bias_m
+    if not view.is_image:  # depth has no ring where it is too deep: its picture is worth less
+        bias_m *= 3
     for _ in range(ROUNDS):
         profile, steps_m = _radial_profiles(view, center_m + shift, level_m, radii_m, SEARCH_M)
         move_m, contrast = _ring_moves(*_ring_scores(profile, steps_m, radii_m, SEARCH_M))
@@ -87,7 +90,10 @@ def fit_rims(
         shift = shift + np.nan_to_num(circles.offset_m)
     assert circles is not None
     offset = np.where(np.isfinite(circles.offset_m), shift, np.nan)
-    return Circles(offset, circles.covariance_m2, circles.widening_m, circles.sectors)
+    # Where some of what is free to be seen of a ring does not look like one, the rest is not sure to be its own.
+    torn = 1 - np.clip(circles.sectors * SECTORS / np.maximum((~blocked).sum(axis=1), 1), 0, 1)
+    covariance = circles.covariance_m2 + (config.torn_rim_m * torn)[:, None, None] ** 2 * np.eye(2)
+    return Circles(offset, covariance, circles.widening_m, circles.sectors)
 
 
 def ring_contrast(
@@ -160,11 +166,7 @@ def _whole_ring_shift(moves_m: FloatArray, correlation: FloatArray, blocked: NDA
     shifts = shifts[np.hypot(*shifts.T) <= WIDE_M]
     at = np.rint((shifts @ NORMALS.T - moves_m[0]) / (moves_m[1] - moves_m[0])).astype(np.intp)
     at = np.clip(at, 0, len(moves_m) - 1)
-    usable = np.where(blocked[..., None], 0.0, np.maximum(correlation, 0.0))
-    total = np.zeros((len(correlation), len(shifts)))
-    for sector in range(SECTORS):
-        total += usable[:, sector, at[:, sector]]
-    return np.asarray(shifts[total.argmax(axis=1)])
+    return np.asarray(shifts[shift_scores(correlation, blocked, at).argmax(axis=1)])
 
 
 def _ring_moves(moves_m: FloatArray, score: FloatArray, correlation: FloatArray) -> tuple[FloatArray, FloatArray]:
