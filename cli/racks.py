@@ -11,7 +11,7 @@ if TYPE_CHECKING:
     from tubepose.capture.source import Capture
     from tubepose.config import Config
     from tubepose.labware import RackModel
-    from tubepose.rack_grid import SlotLattice
+    from tubepose.rack_lattice import SlotLattice
 
 # Stands in a job until its rack is found.
 UNKNOWN = "chen2023-soft-5x10"
@@ -58,7 +58,7 @@ def read_rack(name: str | None, pitch: str | None, slot: str | None) -> RackChoi
 def _lattice(pitch: str, slot: str) -> SlotLattice:
     from tubepose.errors import ConfigError
     from tubepose.labware import SlotShape
-    from tubepose.rack_grid import SlotLattice
+    from tubepose.rack_lattice import SlotLattice
 
     shape, _, size = slot.partition(":")
     if shape not in ("square", "round"):

@@ -8,7 +8,8 @@ from tubepose.config import Config
 from tubepose.errors import ConfigError
 from tubepose.labware import SlotShape, load_rack
 from tubepose.rack import RackStatus
-from tubepose.rack_grid import SlotLattice, register_grid
+from tubepose.rack_grid import register_grid
+from tubepose.rack_lattice import SlotLattice
 from tubepose.rack_naming import catalogue_racks, name_rack
 from tubepose.transforms import HALF_TURN, transform_points
 from tubepose_cli.racks import read_rack
@@ -81,6 +82,15 @@ def test_slots_are_found_by_pitch_and_opening_alone(name):
 def test_slots_of_another_pitch_are_not_found():
     lattice = SlotLattice((22.0, 15.0), SlotShape(shape="square", size_mm=(12.0, 12.0)))
     pose = register_grid(scan(SOFT)[0], lattice, CONFIG)
+    assert pose.status is not RackStatus.OK
+    assert pose.T_camera_rack is None
+
+
+@pytest.mark.parametrize(("name", "shares"), [("round-10ml-3x4", (1.07, 1.0)), ("steel-round-16mm-5x10", (1.0, 1.04))])
+def test_a_pitch_that_is_a_little_off_is_told_of(name, shares):
+    rack = load_rack(name)
+    pitch = tuple(float(side * share) for side, share in zip(rack.grid.pitch_mm, shares, strict=True))
+    pose = register_grid(scan(rack)[0], SlotLattice(pitch, rack.grid.slot), CONFIG)
     assert pose.status is not RackStatus.OK
     assert pose.T_camera_rack is None
 

@@ -16,9 +16,10 @@ from scipy import ndimage
 
 from tubepose.capture.frame import CameraIntrinsics
 from tubepose.config import Config
-from tubepose.labware import RackModel, SlotGrid, SlotShape
+from tubepose.labware import RackModel
 from tubepose.rack_edges import Registration, coarse_sample, pose_of, register_at
 from tubepose.rack_fit import to_frame, top_frame
+from tubepose.rack_lattice import MOST_SLOTS, SlotLattice, other_pitch
 from tubepose.rack_pose import MIN_POINTS, RackPose, RackStatus
 from tubepose.rack_search import TURN_TRIES, Band, levels, turns
 from tubepose.transforms import FloatArray, make_transform
@@ -39,38 +40,6 @@ MOST_BESIDE = 0.05
 MOST_GROWTH = 3
 SIDES = ((1, 0), (-1, 0), (0, 1), (0, -1))
 MOST_CELLS = 1_000_000
-# Nothing is known of the height of a top above its slots' floor: this much is assumed, and it may be off by as much.
-ASSUMED_DEPTH_MM = 50.0
-MOST_SLOTS = (26, 60)
-
-
-@dataclass(frozen=True, slots=True)
-class SlotLattice:
-    """What is known of a rack that has no definition.
-
-    Attributes:
-        pitch_mm: Distance of neighbouring slots, (x, y).
-        slot: Their opening.
-    """
-
-    pitch_mm: tuple[float, float]
-    slot: SlotShape
-
-    def rack(self, rows: int, columns: int, walls_mm: tuple[float, float] | None = None) -> RackModel:
-        """A rack of so many slots; `walls_mm` is the width of its top outside the outer openings along x and y."""
-        pitch, size = np.array(self.pitch_mm), np.array(self.slot.size_mm)
-        walls = np.maximum((pitch - size) if walls_mm is None else np.array(walls_mm), 0.5)
-        outline = pitch * (np.array([columns, rows]) - 1) + size + 2 * walls
-        return RackModel(
-            kind="rack",
-            name=f"grid-{rows}x{columns}",
-            source="Slots seen in the capture; nothing is known of its height and its floor.",
-            outline_mm=(float(outline[0]), float(outline[1])),
-            height_mm=ASSUMED_DEPTH_MM + 1,
-            floor_mm=1.0,
-            floor_tolerance_mm=ASSUMED_DEPTH_MM,
-            grid=SlotGrid(rows=rows, columns=columns, pitch_mm=self.pitch_mm, slot=self.slot),
-        )
 
 
 def register_grid(
@@ -109,6 +78,8 @@ def register_grid(
             "expected: rows or columns are hidden; name the rack"
         )
         best = replace(best, reason=reason)
+    if not best.reason:
+        best = replace(best, reason=other_pitch(points_m, best, rack, lattice, config))
     return replace(pose_of(best, points_m, rack, config, None, intrinsics), rack=rack)
 
 

@@ -147,7 +147,8 @@ def _likeliest(search: RimSearch) -> list[tuple[FloatArray, FloatArray]]:
     ring, inside, outside = (
         np.rint((middle_m + step) / CELL_M * around).astype(np.intp) for step in (0.0, -width_m, width_m)
     )
-    circles = (ring, inside, outside, LEAST_GRAY * float(np.nanmax(picture) - np.nanmin(picture)) + 1e-6)
+    seen = picture[np.isfinite(picture)]
+    circles = (ring, inside, outside, LEAST_GRAY * float(np.ptp(seen) if len(seen) else 0.0) + 1e-6)
     middle, near = _disc(search.reach_m, COARSE), _disc(COARSE * CELL_M, 1)
     start = np.rint((search.center_m - low) / CELL_M).astype(np.intp)
     _, best = ring_votes(picture, start, middle, *circles)

@@ -1,0 +1,94 @@
+"""A lattice of slots that belongs to no rack's definition, and whether another pitch explains the points better."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from tubepose.config import Config
+from tubepose.labware import RackModel, SlotGrid, SlotShape
+from tubepose.rack_edges import Registration, register_at
+from tubepose.transforms import FloatArray
+
+# Nothing is known of the height of a top above its slots' floor: this much is assumed, and it may be off by as much.
+ASSUMED_DEPTH_MM = 50.0
+# Rows and columns that a lattice may have.
+MOST_SLOTS = (26, 60)
+# Other pitches that are tried, as shares of the one given, and how much more evidence tells that it is one of them.
+PITCH_SHARES = (
+    0.5,
+    2 / 3,
+    0.75,
+    0.8,
+    0.85,
+    0.89,
+    0.92,
+    0.94,
+    0.96,
+    0.975,
+    1.025,
+    1.04,
+    1.06,
+    1.08,
+    1.12,
+    1.17,
+    1.25,
+    1.5,
+)
+OTHER_PITCH = 1.05
+
+
+@dataclass(frozen=True, slots=True)
+class SlotLattice:
+    """What is known of a rack that has no definition.
+
+    Attributes:
+        pitch_mm: Distance of neighbouring slots, (x, y).
+        slot: Their opening.
+    """
+
+    pitch_mm: tuple[float, float]
+    slot: SlotShape
+
+    def rack(self, rows: int, columns: int, walls_mm: tuple[float, float] | None = None) -> RackModel:
+        """A rack of so many slots; `walls_mm` is the width of its top outside the outer openings along x and y."""
+        pitch, size = np.array(self.pitch_mm), np.array(self.slot.size_mm)
+        walls = np.maximum((pitch - size) if walls_mm is None else np.array(walls_mm), 0.5)
+        outline = pitch * (np.array([columns, rows]) - 1) + size + 2 * walls
+        return RackModel(
+            kind="rack",
+            name=f"grid-{rows}x{columns}",
+            source="Slots seen in the capture; nothing is known of its height and its floor.",
+            outline_mm=(float(outline[0]), float(outline[1])),
+            height_mm=ASSUMED_DEPTH_MM + 1,
+            floor_mm=1.0,
+            floor_tolerance_mm=ASSUMED_DEPTH_MM,
+            grid=SlotGrid(rows=rows, columns=columns, pitch_mm=self.pitch_mm, slot=self.slot),
+        )
+
+
+def other_pitch(points_m: FloatArray, best: Registration, rack: RackModel, lattice: SlotLattice, config: Config) -> str:
+    """A sentence where slots of another pitch explain the same top better; empty if none do."""
+    size, outline = np.array(lattice.slot.size_mm), np.array(rack.outline_mm)
+    likeliest, most = np.array(lattice.pitch_mm), OTHER_PITCH * best.agreement.evidence
+    for axis in range(2):
+        for share in PITCH_SHARES:
+            pitch = np.array(lattice.pitch_mm)
+            pitch[axis] *= share
+            counts = np.floor((outline - size) / pitch + 1e-6).astype(int) + 1
+            if np.any(pitch <= size) or counts.min() < 1 or counts[1] > MOST_SLOTS[0] or counts[0] > MOST_SLOTS[1]:
+                continue
+            walls = (outline - pitch * (counts - 1) - size) / 2
+            other = SlotLattice((float(pitch[0]), float(pitch[1])), lattice.slot).rack(
+                int(counts[1]), int(counts[0]), (float(walls[0]), float(walls[1]))
+            )
+            evidence = register_at(points_m, best.fit.T_camera_rack, other, config.rack).agreement.evidence
+            if evidence > most:
+                likeliest, most = pitch, evidence
+    if np.allclose(likeliest, lattice.pitch_mm):
+        return ""
+    given, found = (" x ".join(f"{side:.3g}" for side in sides) for sides in (lattice.pitch_mm, likeliest))
+    return (
+        f"slots {found} mm apart explain the points better than the pitch that is given, {given} mm: measure it again"
+    )
