@@ -1,5 +1,7 @@
 """Registration by edges where little of the rack is seen: covers, cuts, neighbours, full racks; and its covariance."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import scenes
@@ -8,6 +10,7 @@ from tubepose import rack_edges
 from tubepose.config import Config
 from tubepose.labware import load_rack, load_tube
 from tubepose.rack import RackStatus, register_rack
+from tubepose.rack_acceptance import too_coarse
 from tubepose.rack_field import top_field
 from tubepose.transforms import HALF_TURN, invert_transform, make_transform, transform_points
 
@@ -141,3 +144,25 @@ def test_a_start_some_slots_off_is_moved_before_it_is_refined(monkeypatch, slots
     assert millimetres < 0.05
     assert found.reason == ""
     assert len(fits) == 1
+
+
+def test_a_place_with_much_less_evidence_than_an_accepted_one_is_not_refined():
+    points = transform_points(T_TRUE, hidden_by(TOP, SOFT.all_slots[5:30], 9e-3))
+    best = rack_edges.register_at(points, T_TRUE, SOFT, CONFIG.rack)
+    assert best.reason == ""
+
+    def no_rival(shift_m, found):
+        T = T_TRUE @ make_transform(np.eye(3), np.array([shift_m, 0.0, 0.0]))
+        near = rack_edges.seen_near(points, T, SOFT)
+        return rack_edges._no_rival(near, rack_edges.roughly(near, T, SOFT), found, SOFT, CONFIG.rack)
+
+    half_a_rack = 5 * SOFT.grid.pitch_mm[0] * 1e-3
+    assert no_rival(half_a_rack, [best])
+    assert not no_rival(0.0, [best])
+    assert not no_rival(half_a_rack, [replace(best, reason="another rack?")])  # nothing is accepted yet
+    assert not no_rival(half_a_rack, [])
+
+
+def test_a_spacing_that_is_not_known_is_not_called_coarse():
+    assert too_coarse(float("nan"), SOFT, CONFIG.rack) == ""
+    assert "2.00 mm apart" in too_coarse(2e-3, SOFT, CONFIG.rack)

@@ -63,9 +63,9 @@ def too_noisy(noise_m: float, reason: str, config: RackConfig) -> str:
 
 
 def too_coarse(spacing_m: float, rack: RackModel, config: RackConfig) -> str:
-    """Sentence for points farther apart than the narrowest rib is wide; empty if they are not."""
+    """Sentence for points farther apart than the narrowest rib is wide; empty if they are not, or it is not known."""
     limit_m = config.max_spacing_ratio * rack.min_rib_m
-    if spacing_m <= limit_m:
+    if not spacing_m > limit_m:
         return ""
     return (
         f"points are {spacing_m * 1e3:.2f} mm apart, and the ribs of {rack.name} are "
