@@ -124,7 +124,7 @@ def test_a_training_can_start_from_a_models_file(pictures, tmp_path, model):
     with torch.no_grad():
         expected, found = network(images), trainer.network.eval()(images)
     assert torch.allclose(found, expected, rtol=1e-2, atol=1e-2)  # weights of 16 bits
-    # In training mode its normalisations meet what they expect: the first losses are those of the network before.
+    # Its normalisations stand for what they meet in the first batches.
     head = trainer.network.head.stems[0].bn
     seen = []
     handle = head.register_forward_pre_hook(lambda _layer, inputs: seen.append(inputs[0].detach()))
@@ -187,7 +187,7 @@ def test_a_rack_and_a_tube_of_ones_own_are_found_after_a_minute_or_two(tmp_path)
     mine = f"{tmp_path / 'rack.yaml'},{tmp_path / 'tube.yaml'}"
     out = tmp_path / "mine.onnx"
     ended = tubepose(
-        "detector", "train", "--labware", mine, "--out", out, "--pictures", "32", "--steps", "200", "--batch", "4",
+        "detector", "train", "--labware", mine, "--out", out, "--pictures", "32", "--steps", "400", "--batch", "4",
         "--sample-side", "256", "--late-side", "256", "--side", "320", "--whole-side", "256",
         "--picture-side", "512", "--view", "scanner", "--variants", "0",
         "--unseen", "8", "--rate", "3e-3",
@@ -203,6 +203,5 @@ def test_a_rack_and_a_tube_of_ones_own_are_found_after_a_minute_or_two(tmp_path)
     )  # fmt: skip
     assert judged.code == 0, judged.err
     table = pd.read_csv(tmp_path / "out" / "detection_summary.csv").set_index("class")
-    # Half, not more: what so few steps learn depends on how a machine rounds (tubes: 0.64 and 0.72 on two).
-    assert table.loc["racks", "ap50"] >= 0.5
+    assert table.loc["racks", "recall"] >= 0.75
     assert table.loc["tubes", "ap50"] >= 0.5

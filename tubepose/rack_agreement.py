@@ -121,9 +121,7 @@ def measure_agreement(points_m: FloatArray, fit: Fit, rack: RackModel, config: R
 def rough_evidence(points_m: FloatArray, rough: RoughFit, spacing_m: float, rack: RackModel) -> float:
     """The evidence of a rough fit among points (N, 3), camera frame, that lie `spacing_m` apart."""
     window_m = float(np.clip(rough.scatter_m, *JUDGED_M))
-    evidence, _, _ = evidence_of(
-        label(np.ascontiguousarray(points_m, float), rack_frame(rough, rack), rack, window_m), rack
-    )
+    evidence, _, _ = evidence_of(label(points_m, rack_frame(rough, rack), rack, window_m), rack)
     return evidence * _alike(spacing_m)
 
 

@@ -19,7 +19,7 @@ from tubepose.config import Config
 from tubepose.labware import RackModel
 from tubepose.rack_edges import Registration, coarse_sample, pose_of, register_at
 from tubepose.rack_fit import to_frame, top_frame
-from tubepose.rack_lattice import MOST_SLOTS, SlotLattice, other_pitch
+from tubepose.rack_lattice import SlotLattice, countable, other_pitch
 from tubepose.rack_pose import MIN_POINTS, RackPose, RackStatus
 from tubepose.rack_search import TURN_TRIES, Band, levels, turns
 from tubepose.transforms import FloatArray, make_transform
@@ -117,12 +117,13 @@ def _with_line(
 ) -> tuple[RackModel, FloatArray]:
     """A rack with one row or column more on a side, (x, y) of -1, 0 or 1, and its T_camera_rack."""
     assert rack.grid is not None
-    pitch, size = np.array(lattice.pitch_mm), np.array(lattice.slot.size_mm)
     counts = np.array([rack.grid.columns, rack.grid.rows])
-    walls = (np.array(rack.outline_mm) - pitch * (counts - 1) - size) / 2
+    walls_mm = lattice.walls_mm(np.array(rack.outline_mm), counts)
     counts = counts + np.abs(side)
-    grown = lattice.rack(int(counts[1]), int(counts[0]), (float(walls[0]), float(walls[1])))
-    return grown, T_camera_rack @ make_transform(np.eye(3), np.array([*(side * pitch * 5e-4), 0.0]))
+    grown = lattice.rack(int(counts[1]), int(counts[0]), walls_mm)
+    return grown, T_camera_rack @ make_transform(
+        np.eye(3), np.array([*(side * np.array(lattice.pitch_mm) * 5e-4), 0.0])
+    )
 
 
 def _racks(points_m: FloatArray, lattice: SlotLattice, config: Config) -> Iterator[tuple[FloatArray, RackModel]]:
@@ -195,7 +196,7 @@ def _count(lines: _Lines, lattice: SlotLattice) -> tuple[FloatArray, RackModel] 
     low, high = extent
     first, last = (np.ceil((low + size_m / 2 - SLACK_M) / pitch_m), np.floor((high - size_m / 2 + SLACK_M) / pitch_m))
     counts = (last - first + 1).astype(int)
-    if counts.min() < 1 or counts.max() < 2 or counts[1] > MOST_SLOTS[0] or counts[0] > MOST_SLOTS[1]:
+    if not countable(counts) or counts.max() < 2:
         return None
     walls_m = ((first * pitch_m - size_m / 2 - low) + (high - last * pitch_m - size_m / 2)) / 2
     rack = lattice.rack(int(counts[1]), int(counts[0]), (float(1e3 * walls_m[0]), float(1e3 * walls_m[1])))

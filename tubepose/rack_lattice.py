@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import product
 
 import numpy as np
+from numpy.typing import NDArray
 
 from tubepose.config import Config
 from tubepose.labware import RackModel, SlotGrid, SlotShape
@@ -17,25 +19,8 @@ ASSUMED_DEPTH_MM = 50.0
 MOST_SLOTS = (26, 60)
 # Other pitches that are tried, as shares of the one given, and how much more evidence tells that it is one of them.
 PITCH_SHARES = (
-    0.5,
-    2 / 3,
-    0.75,
-    0.8,
-    0.85,
-    0.89,
-    0.92,
-    0.94,
-    0.96,
-    0.975,
-    1.025,
-    1.04,
-    1.06,
-    1.08,
-    1.12,
-    1.17,
-    1.25,
-    1.5,
-)
+    0.5, 2 / 3, 0.75, 0.8, 0.85, 0.89, 0.92, 0.94, 0.96, 0.975, 1.025, 1.04, 1.06, 1.08, 1.12, 1.17, 1.25, 1.5
+)  # fmt: skip
 OTHER_PITCH = 1.05
 
 
@@ -67,25 +52,32 @@ class SlotLattice:
             grid=SlotGrid(rows=rows, columns=columns, pitch_mm=self.pitch_mm, slot=self.slot),
         )
 
+    def walls_mm(self, outline_mm: FloatArray, counts: NDArray[np.intp]) -> tuple[float, float]:
+        """What so many columns and rows leave of a top (x, y) beside their outer openings, on each side."""
+        across, along = (outline_mm - np.array(self.pitch_mm) * (counts - 1) - np.array(self.slot.size_mm)) / 2
+        return float(across), float(along)
+
+
+def countable(counts: NDArray[np.intp]) -> bool:
+    """Whether a lattice can have so many columns and rows."""
+    return bool(counts.min() >= 1 and counts[1] <= MOST_SLOTS[0] and counts[0] <= MOST_SLOTS[1])
+
 
 def other_pitch(points_m: FloatArray, best: Registration, rack: RackModel, lattice: SlotLattice, config: Config) -> str:
     """A sentence where slots of another pitch explain the same top better; empty if none do."""
     size, outline = np.array(lattice.slot.size_mm), np.array(rack.outline_mm)
     likeliest, most = np.array(lattice.pitch_mm), OTHER_PITCH * best.agreement.evidence
-    for axis in range(2):
-        for share in PITCH_SHARES:
-            pitch = np.array(lattice.pitch_mm)
-            pitch[axis] *= share
-            counts = np.floor((outline - size) / pitch + 1e-6).astype(int) + 1
-            if np.any(pitch <= size) or counts.min() < 1 or counts[1] > MOST_SLOTS[0] or counts[0] > MOST_SLOTS[1]:
-                continue
-            walls = (outline - pitch * (counts - 1) - size) / 2
-            other = SlotLattice((float(pitch[0]), float(pitch[1])), lattice.slot).rack(
-                int(counts[1]), int(counts[0]), (float(walls[0]), float(walls[1]))
-            )
-            evidence = register_at(points_m, best.fit.T_camera_rack, other, config.rack).agreement.evidence
-            if evidence > most:
-                likeliest, most = pitch, evidence
+    for axis, share in product(range(2), PITCH_SHARES):
+        pitch = np.array(lattice.pitch_mm)
+        pitch[axis] *= share
+        counts = np.floor((outline - size) / pitch + 1e-6).astype(np.intp) + 1
+        if np.any(pitch <= size) or not countable(counts):
+            continue
+        other = SlotLattice((float(pitch[0]), float(pitch[1])), lattice.slot)
+        packed = other.rack(int(counts[1]), int(counts[0]), other.walls_mm(outline, counts))
+        evidence = register_at(points_m, best.fit.T_camera_rack, packed, config.rack).agreement.evidence
+        if evidence > most:
+            likeliest, most = pitch, evidence
     if np.allclose(likeliest, lattice.pitch_mm):
         return ""
     given, found = (" x ".join(f"{side:.3g}" for side in sides) for sides in (lattice.pitch_mm, likeliest))

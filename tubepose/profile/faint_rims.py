@@ -90,12 +90,13 @@ class RimSearch:
 def find_faint_rims(search: RimSearch) -> FaintRims:
     """Look for a rim, bright or dark, in each of some slots."""
     bright, dark = (
-        _measured(place, votes, search, is_dark) for is_dark, (place, votes) in enumerate(_likeliest(search))
+        _measured(*likeliest, search, is_dark=is_dark)
+        for likeliest, is_dark in zip(_likeliest(search), (False, True), strict=True)
     )
     return bright.where(bright.contrast >= dark.contrast, dark)
 
 
-def _measured(middle: FloatArray, votes: FloatArray, search: RimSearch, is_dark: int) -> FaintRims:
+def _measured(middle: FloatArray, votes: FloatArray, search: RimSearch, *, is_dark: bool) -> FaintRims:
     """Rings of one kind about middles (S, 2) that won enough votes (S,), measured and judged."""
     circles, contrast = unknown_circles(len(middle)), np.full(len(middle), -np.inf)
     at = np.flatnonzero(votes >= search.config.min_ring_votes)

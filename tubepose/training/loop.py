@@ -19,7 +19,7 @@ from tubepose.errors import DetectorError
 from tubepose.report import write_aside
 from tubepose.training.augmentation import Views, draw_sample
 from tubepose.training.network import build_network
-from tubepose.training.start import CHECKPOINT, MODEL_SUFFIX, load_start, match_statistics
+from tubepose.training.start import CHECKPOINT, load_start, match_statistics
 
 if TYPE_CHECKING:
     import torch
@@ -99,11 +99,10 @@ class Trainer:
         torch.manual_seed(recipe.seed)
         self.device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
         network = build_network(len(files.classes), pretrained=recipe.pretrained and start is None)
-        if start is not None:
-            load_start(network, start, files.classes)
+        unfitted = start is not None and load_start(network, start, files.classes)
         self.network = network.to(self.device, memory_format=torch.channels_last)
         resumed = (folder / CHECKPOINT).is_file()
-        if start is not None and start.suffix == MODEL_SUFFIX and not resumed:
+        if unfitted and not resumed:
             self._match_statistics()
         _freeze(self.network, recipe.frozen_blocks)
         self.optimizer = torch.optim.AdamW(_groups(self.network, recipe), lr=recipe.rate)

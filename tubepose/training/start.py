@@ -17,12 +17,12 @@ if TYPE_CHECKING:
     import torch
 
 CHECKPOINT = "checkpoint.pt"
-MODEL_SUFFIX = ".onnx"
+_MODEL_SUFFIX = ".onnx"
 _STEM = "backbone.backbone.stem.0"
 """The layer that takes the image: RGB in training, BGR in the file."""
 
 
-def load_start(network: torch.nn.Module, start: Path, classes: Sequence[str]) -> None:
+def load_start(network: torch.nn.Module, start: Path, classes: Sequence[str]) -> bool:
     """Give a network of `build_network` the weights of another training.
 
     In an ONNX file every normalisation is part of the convolution before it. The network is given those convolutions,
@@ -34,13 +34,18 @@ def load_start(network: torch.nn.Module, start: Path, classes: Sequence[str]) ->
         start: A checkpoint, whose averaged weights are taken, or an .onnx file of `export_onnx`.
         classes: Class names that it is to learn.
 
+    Returns:
+        Whether its normalisations have to be fitted before it learns.
+
     Raises:
         DetectorError: The file is neither, or it is of another network or other classes.
     """
-    if start.suffix == MODEL_SUFFIX:
+    is_model = start.suffix == _MODEL_SUFFIX
+    if is_model:
         _load_model(network, start, classes)
     else:
         _load_checkpoint(network, start)
+    return is_model
 
 
 def match_statistics(network: torch.nn.Module, images: Iterable[torch.Tensor]) -> None:
@@ -98,7 +103,7 @@ def _load_checkpoint(network: torch.nn.Module, start: Path) -> None:
         what = " ".join(str(problem).split())[:120]
         raise DetectorError(
             f"{start}: no checkpoint to start from ({what}); expected {CHECKPOINT} of a training with as many classes, "
-            f"or a model that tubepose trained ({MODEL_SUFFIX})"
+            f"or a model that tubepose trained ({_MODEL_SUFFIX})"
         ) from None
 
 
