@@ -1,6 +1,9 @@
 """Definitions, catalogue, geometry and drawings of labware."""
 
+import pickle
 import re
+import subprocess
+import sys
 from importlib.resources import files
 from itertools import pairwise
 from pathlib import Path
@@ -283,6 +286,22 @@ def test_unknown_names_are_told_with_a_guess() -> None:
         load_tube("chen2023-tube1")
     with pytest.raises(LabwareError, match="unknown rack 'chen2023-tube-1'"):
         load_rack("chen2023-tube-1")
+
+
+def test_what_is_equal_hashes_alike_after_copies_and_in_another_process() -> None:
+    rack = load_rack("chen2023-soft-5x10")
+    before = hash(rack)
+    higher = rack.model_copy(update={"height_mm": rack.height_mm + 1})
+    again = RackModel.model_validate(rack.model_dump() | {"height_mm": rack.height_mm + 1})
+    assert higher == again
+    assert hash(higher) == hash(again) != before
+    # Texts have other hashes there.
+    told = """if True:
+        import pickle, sys
+        rack = pickle.load(sys.stdin.buffer)
+        print(rack in {type(rack).model_validate(rack.model_dump())})"""
+    ran = subprocess.run([sys.executable, "-c", told], input=pickle.dumps(rack), capture_output=True, check=True)
+    assert ran.stdout.split() == [b"True"]
 
 
 def test_a_file_of_another_kind_is_refused(tmp_path: Path) -> None:

@@ -8,7 +8,6 @@ from itertools import islice
 
 import numpy as np
 
-from tubepose import rack_view_kernels as view_kernels
 from tubepose.capture.frame import CameraIntrinsics
 from tubepose.capture.session import SlotHint
 from tubepose.config import Config, RackConfig, RackTopConfig
@@ -16,23 +15,17 @@ from tubepose.labware import RackModel
 from tubepose.preprocessing import point_spacing_m, thin
 from tubepose.rack_acceptance import outline_words, too_coarse
 from tubepose.rack_agreement import Agreement, contradiction, measure_agreement, outline_fits, rough_evidence
-from tubepose.rack_evidence import likelier_step_m
 from tubepose.rack_field import top_field
-from tubepose.rack_fit import HOPELESS_SHARE, Fit, RoughFit, camera_place, rack_frame, refine, roughly, top_frame
+from tubepose.rack_fit import Fit, RoughFit, filled, rack_frame, refine
+from tubepose.rack_looks import SLOT_STEPS, look_at, on_lattice, seen_near
 from tubepose.rack_pose import MIN_POINTS, RackPose, RackStatus, choose_turn, unused_hint
 from tubepose.rack_search import Band, levels, search
 from tubepose.transforms import HALF_TURN, FloatArray, make_transform
 
-# A rack full of caps shows its lattice better than its ends: so many slots may the search be off.
-SLOT_STEPS = 6
-# Steps that lead back to a place this near are of no use.
-NEAR_STEP_M = 4e-3
 # Places whose coarse picture agrees less than this, compared with one that was accepted, are no rivals of it.
 RIVAL_WORTH = 0.4
 # The fine rounds add no more than this to a pose's evidence.
 ROUGH_MARGIN = 1.05
-# Beside a coarse place: its own error, and what lies outside of a top.
-NEAR_M = 0.06
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -51,7 +44,8 @@ def register_edges(
     if len(points_m) < MIN_POINTS:
         reason = f"{len(points_m)} valid points on the rack, expected at least {MIN_POINTS}"
         return RackPose(RackStatus.INSUFFICIENT, reason)
-    best = best_registration(points_m, levels(coarse_sample(points_m, config.rack_top), config.rack_top), rack, config)
+    few_m = coarse_sample(points_m, config.rack_top)
+    best = best_registration(points_m, few_m, levels(few_m, config.rack_top), rack, config)
     return pose_of(best, points_m, rack, config, hint, intrinsics)
 
 
@@ -76,14 +70,27 @@ def pose_of(
 
 
 def best_registration(
-    points_m: FloatArray, found_levels: Iterable[list[Band]], rack: RackModel, config: Config, most: int | None = None
+    points_m: FloatArray,
+    few_m: FloatArray,
+    found_levels: Iterable[list[Band]],
+    rack: RackModel,
+    config: Config,
+    most: int | None = None,
 ) -> Registration | None:
     """The registration with most evidence of those that nothing contradicts, else of all; None where no band is found.
 
     The first one that sees much of the top is taken: only where little is seen can another place look like the rack.
     Places that are worth much less than one that was accepted are not looked at, nor, if hardly a point contradicts it,
     those on other level directions than its own; and no more than `most`. Those that a rough look tells to be no rivals
-    of it are looked at no further.
+    are looked at no further.
+
+    Args:
+        points_m: What a pose is refined with and judged by, camera frame, shape (N, 3), metres.
+        few_m: Some of them, which the search and rough looks see: `coarse_sample`.
+        found_levels: Bands of those, one level direction after the other.
+        rack: The rack.
+        config: All sections.
+        most: Places that are looked at.
     """
     found: list[Registration] = []
     been: list[FloatArray] = []
@@ -98,11 +105,12 @@ def best_registration(
     for hypothesis in islice(search(until_settled(), rack), most):
         if hypothesis.worth < RIVAL_WORTH * worth or _known(hypothesis.T_camera_rack, been, rack):
             continue
-        near_m, rough = _on_lattice(points_m, hypothesis.T_camera_rack, rack)
-        if _no_rival(near_m, rough, found, rack, config.rack):
+        near_m, rough = on_lattice(few_m, hypothesis.T_camera_rack, rack)
+        if _no_rival(near_m, rough, len(points_m) / len(few_m), found, rack, config.rack):
             been.append(rack_frame(rough, rack))
             continue
-        registration = _settled(points_m, near_m, rough, rack, config.rack)
+        near_m = seen_near(points_m, rack_frame(rough, rack), rack)
+        registration = _settled(points_m, near_m, filled(rough, near_m, rack), rack, config.rack)
         if not registration.reason and _clear(registration, config.rack):
             return registration
         registration = _level(registration, hypothesis.level, config.rack)
@@ -142,14 +150,22 @@ def _known(T_camera_rack: FloatArray, been: list[FloatArray], rack: RackModel) -
 
 
 def _no_rival(
-    near_m: FloatArray, rough: RoughFit, found: list[Registration], rack: RackModel, config: RackConfig
+    near_m: FloatArray,
+    rough: RoughFit,
+    weight: float,
+    found: list[Registration],
+    rack: RackModel,
+    config: RackConfig,
 ) -> bool:
-    """Whether a rough fit has too little evidence to be a rival of the best pose that was accepted before it."""
+    """Whether a rough fit has too little evidence to be a rival of the best pose that was accepted before it.
+
+    Each of the points that it has seen stands for `weight` of those that the accepted pose was judged by.
+    """
     accepted = [other.agreement for other in found if not other.reason]
     if not accepted:
         return False
     best = max(accepted, key=lambda agreement: agreement.evidence)
-    most = ROUGH_MARGIN * rough_evidence(near_m, rough, best.spacing_m, rack)
+    most = ROUGH_MARGIN * weight * rough_evidence(near_m, rough, best.spacing_m, rack)
     return most * config.min_rival_ratio < best.evidence
 
 
@@ -178,20 +194,9 @@ def coarse_sample(points_m: FloatArray, config: RackTopConfig) -> FloatArray:
     return thin(points_m, min(max(config.coarse_points, len(points_m) // 3), config.search_points))
 
 
-def seen_near(points_m: FloatArray, T_camera_rack: FloatArray, rack: RackModel) -> FloatArray:
-    """Points whose lines of sight cross the level of a top at its outline or near it.
-
-    Samples are drawn from the points that are given: of a whole frame with a bright table few would be of the rack.
-    """
-    T = top_frame(T_camera_rack, rack)
-    points_m = np.ascontiguousarray(points_m, float)
-    near_m = view_kernels.seen_through(points_m, T[:3, :3], T[:3, 3], camera_place(T), rack.outline_m / 2 + NEAR_M)
-    return near_m if len(near_m) >= MIN_POINTS else points_m
-
-
 def register_at(points_m: FloatArray, T_camera_rack: FloatArray, rack: RackModel, config: RackConfig) -> Registration:
     """Refine a coarse pose and judge it; where one a slot farther has more evidence, go there first."""
-    return _settled(points_m, *_on_lattice(points_m, T_camera_rack, rack), rack, config)
+    return _settled(points_m, *on_lattice(points_m, T_camera_rack, rack), rack, config)
 
 
 def _settled(
@@ -206,34 +211,13 @@ def _settled(
         if agreement.slot_margin >= 0 or stray:
             break
         T_step = make_transform(np.eye(3), np.array([*agreement.step_m, 0.0]))
-        near_m, rough = _look_at(points_m, fit.T_camera_rack @ T_step, rack)
+        near_m, rough = look_at(points_m, fit.T_camera_rack @ T_step, rack)
         farther = refine(rough, rack)
         there = measure_agreement(near_m, farther, rack, config)
         if there.evidence <= agreement.evidence:
             break
         fit, agreement = farther, there
     return Registration(fit, agreement, contradiction(agreement, fit, rack, config))
-
-
-def _on_lattice(points_m: FloatArray, T_camera_rack: FloatArray, rack: RackModel) -> tuple[FloatArray, RoughFit]:
-    """Points near a coarse pose, and a rough fit there or as many slots farther as a first look at it says."""
-    near_m, rough = _look_at(points_m, T_camera_rack, rack)
-    been: list[FloatArray] = []
-    for _ in range(SLOT_STEPS):
-        step_m = likelier_step_m(rough, rack)
-        if step_m is None or rough.stray > HOPELESS_SHARE:
-            break
-        been.append(rough.T_camera_top[:3, 3])
-        T_there = rack_frame(rough, rack) @ make_transform(np.eye(3), np.array([*step_m, 0.0]))
-        if any(np.linalg.norm(T_there @ [0, 0, rack.height_m, 1] - [*place, 1]) < NEAR_STEP_M for place in been):
-            break
-        near_m, rough = _look_at(points_m, T_there, rack)
-    return near_m, rough
-
-
-def _look_at(points_m: FloatArray, T_camera_rack: FloatArray, rack: RackModel) -> tuple[FloatArray, RoughFit]:
-    near_m = seen_near(points_m, T_camera_rack, rack)
-    return near_m, roughly(near_m, T_camera_rack, rack)
 
 
 def _pose(

@@ -10,7 +10,7 @@ shadow leaves. `Labels` has them as evidence all the same.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -113,12 +113,24 @@ def top_frame(T_camera_rack: FloatArray, rack: RackModel) -> FloatArray:
 
 def roughly(points_m: FloatArray, T_camera_rack: FloatArray, rack: RackModel) -> RoughFit:
     """The first rounds from a coarse pose (2 mm and 1.5 degrees off at most), with points (N, 3), camera frame."""
-    T, reach_m = top_frame(T_camera_rack, rack), rack.outline_m / 2 + 5e-3
-    kept = kernels.near_top(np.ascontiguousarray(points_m, float), T[:3, :3], T[:3, 3], reach_m, 5e-3)
+    T = top_frame(T_camera_rack, rack)
+    kept = _near_top(points_m, T, rack)
     state = RoughFit(T, kept, _thinned(kept, ROUGH_POINTS), WIDEST_M, UNKNOWN * np.eye(6))
     for blur_m, widths_m in ROUNDS_M[:ROUGH_ROUNDS]:
         _step(state.rough_m, state, top_field(rack), blur_m, widths_m, False)
     return state
+
+
+def filled(rough: RoughFit, points_m: FloatArray, rack: RackModel) -> RoughFit:
+    """A rough fit to some of the points, with all of them, (N, 3), camera frame, to go on with."""
+    kept = _near_top(points_m, rough.T_camera_top, rack)
+    return replace(rough, kept_m=kept, rough_m=_thinned(kept, ROUGH_POINTS))
+
+
+def _near_top(points_m: FloatArray, T_camera_top: FloatArray, rack: RackModel) -> FloatArray:
+    """Points (N, 3), camera frame, a little beside a top and above and below it at most."""
+    R, origin_m, reach_m = T_camera_top[:3, :3], T_camera_top[:3, 3], rack.outline_m / 2 + 5e-3
+    return np.asarray(kernels.near_top(np.ascontiguousarray(points_m, float), R, origin_m, reach_m, 5e-3))
 
 
 def refine(state: RoughFit, rack: RackModel) -> Fit:

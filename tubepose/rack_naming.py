@@ -103,9 +103,10 @@ def _registrations(
 ) -> list[tuple[RackModel, Registration]]:
     """The best registration of every rack that has one, at the first level direction at which a rack is accepted."""
     best: dict[str, Registration] = {}
-    for level in levels(coarse_sample(points_m, config.rack_top), config.rack_top):
+    few_m = coarse_sample(points_m, config.rack_top)
+    for level in levels(few_m, config.rack_top):
         for rack in racks:
-            found = best_registration(points_m, [level], rack, config, PLACES)
+            found = best_registration(points_m, few_m, [level], rack, config, PLACES)
             before = best.get(rack.name)
             if found is not None and (before is None or _rank(found) < _rank(before)):
                 best[rack.name] = found

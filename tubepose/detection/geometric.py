@@ -89,8 +89,8 @@ class GeometricDetector:
         if self.config.rack.method == "obb-icp":
             top = find_rack_top(points_m, self.rack, config)
             return top.T_camera_top if top is not None and top.fits(config) else None
-        found_levels = levels(coarse_sample(points_m, config), config)
-        best = best_registration(points_m, found_levels, self.rack, self.config)
+        few_m = coarse_sample(points_m, config)
+        best = best_registration(points_m, few_m, levels(few_m, config), self.rack, self.config)
         return None if best is None or best.reason else top_frame(best.fit.T_camera_rack, self.rack)
 
     def _part(self, points_m: FloatArray, centers_m: FloatArray) -> NDArray[np.intp]:

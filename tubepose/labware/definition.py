@@ -10,7 +10,7 @@ Tube: origin at the outermost point of the bottom on the axis, z towards the ope
 from __future__ import annotations
 
 from functools import cached_property
-from typing import Annotated
+from typing import Annotated, Any, Self
 
 from pydantic import BaseModel, ConfigDict, Field
 
@@ -31,4 +31,19 @@ class Definition(BaseModel):
         return all(getattr(self, name) == getattr(other, name) for name in type(self).model_fields)
 
     def __hash__(self) -> int:
+        return self._hash
+
+    @cached_property
+    def _hash(self) -> int:
         return hash((type(self), *(getattr(self, name) for name in type(self).model_fields)))
+
+    def __copy__(self) -> Self:
+        """A copy that may be changed: `model_copy` makes its changes to one."""
+        copied = super().__copy__()
+        copied.__dict__.pop("_hash", None)
+        return copied
+
+    def __getstate__(self) -> dict[Any, Any]:
+        """What is sent to another process, in which texts have other hashes."""
+        state = super().__getstate__()
+        return {**state, "__dict__": {name: value for name, value in state["__dict__"].items() if name != "_hash"}}
