@@ -9,10 +9,11 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
+
+from tubepose.compiled import compiled
 
 
-@njit(cache=True)
+@compiled
 def points_over(cloud_m, rotation, translation_m, lowest_m, highest_m, half_m):
     """Points of a cloud (H, W, 3) in the rack's frame, shape (N, 3), between two heights and over the outline."""
     height, width = cloud_m.shape[0], cloud_m.shape[1]
@@ -32,7 +33,7 @@ def points_over(cloud_m, rotation, translation_m, lowest_m, highest_m, half_m):
     return points[:count].copy()
 
 
-@njit(cache=True)
+@compiled
 def level_pictures(points_m, step, camera_m, level_m, below_m, above_m, half_m, cell_m, filled, off):
     """Fill two pictures (X, Y) of the points near a level as seen from above: 1 where there is one, and its height.
 
@@ -51,7 +52,7 @@ def level_pictures(points_m, step, camera_m, level_m, below_m, above_m, half_m, 
                 off[i, j] = height
 
 
-@njit(cache=True)
+@compiled
 def best_places(score, low, high, wanted, close, near):
     """Best score in every wanted window [low, high) of a picture, and its place in cells: shape (S, 3).
 
@@ -83,7 +84,7 @@ def best_places(score, low, high, wanted, close, near):
     return found
 
 
-@njit(cache=True)
+@compiled
 def nearest_tops(centers_m, radii_m, near_m, low_m, cell_m, shape):
     """Top whose middle is nearest to each cell of a picture (X, Y) whose cell 0, 0 lies at `low_m`; -1 outside of all.
 
@@ -105,7 +106,7 @@ def nearest_tops(centers_m, radii_m, near_m, low_m, cell_m, shape):
     return label
 
 
-@njit(cache=True)
+@compiled
 def grouped(points_m, label, count):
     """Points (N, 3) ordered by their labels from 0 to count - 1, those without one left out, and where each ends."""
     ends = np.zeros(count + 1, np.intp)
@@ -124,7 +125,7 @@ def grouped(points_m, label, count):
     return ordered, ends
 
 
-@njit(cache=True)
+@compiled
 def cell_values(points_m, low_m, cell_m, picture):
     """Values (N,) of the cells of points in a picture (X, Y) whose cell 0, 0 lies at `low_m`; the border is outside."""
     values = np.empty(len(points_m), picture.dtype)
@@ -138,7 +139,7 @@ def cell_values(points_m, low_m, cell_m, picture):
     return values
 
 
-@njit(cache=True)
+@compiled
 def near_planes(points_m, label, centers_m, levels_m, band_m, usable):
     """Rows of the points whose tube is usable and whose height is near its level; their tubes and offsets (N, 2)."""
     rows = np.empty(len(points_m), np.intp)
@@ -159,7 +160,7 @@ def near_planes(points_m, label, centers_m, levels_m, band_m, usable):
     return rows, of, offset_m
 
 
-@njit(cache=True)
+@compiled
 def ends_on_planes(points_m, rows, of, offset_m, planes, least_m, near_m, centers_m, camera_m):
     """Points of tops that are far enough out and on their planes (T, 3): their tubes, and their offsets (N, 2).
 
@@ -184,7 +185,7 @@ def ends_on_planes(points_m, rows, of, offset_m, planes, least_m, near_m, center
     return kept[:count].copy(), flat_m[:count].copy()
 
 
-@njit(cache=True)
+@compiled
 def plane_sums(label, offset_m, height_m, expected_m, band_m, radius_m, planes, sigma_m, step):
     """Sums of Tukey's weights w about planes (T, 3), shape (T, 11): of every `step`-th point.
 
@@ -217,7 +218,7 @@ def plane_sums(label, offset_m, height_m, expected_m, band_m, radius_m, planes, 
     return sums
 
 
-@njit(cache=True)
+@compiled
 def sector_of(x, y, tangents):
     """Sector of a direction, counted from -x over -y: four times one more than there are tangents of their borders."""
     x, y = -x, -y
@@ -235,7 +236,7 @@ def sector_of(x, y, tangents):
     return sector
 
 
-@njit(cache=True)
+@compiled
 def sector_counts(label, offset_m, shift_m, lower_m, low_m, high_m, sectors):
     """Points of every tube and sector between `lower` and `low`, and between `low` and `high`: two (T, sectors).
 
@@ -244,20 +245,21 @@ def sector_counts(label, offset_m, shift_m, lower_m, low_m, high_m, sectors):
     core = np.zeros((len(low_m), sectors), np.intp)
     edge = np.zeros((len(low_m), sectors), np.intp)
     tangents = np.tan(np.arange(1, sectors // 4) * (2.0 * math.pi / sectors))
+    lower2, low2, high2 = lower_m * np.abs(lower_m), low_m**2, high_m**2
     for k in range(len(label)):
         t = label[k]
         x, y = offset_m[k, 0] - shift_m[t, 0], offset_m[k, 1] - shift_m[t, 1]
-        rho = math.sqrt(x * x + y * y)
-        if lower_m[t] < rho <= high_m[t]:
+        rho2 = x * x + y * y
+        if lower2[t] < rho2 <= high2[t]:
             sector = sector_of(x, y, tangents)
-            if rho <= low_m[t]:
+            if rho2 <= low2[t]:
                 core[t, sector] += 1
             else:
                 edge[t, sector] += 1
     return core, edge
 
 
-@njit(cache=True)
+@compiled
 def radial_brightness(
     picture, camera, rotation, translation_m, centers_m, levels_m, radii_m, steps_m, sectors, per_sector
 ):
@@ -268,25 +270,28 @@ def radial_brightness(
     """
     height, width = picture.shape
     fx, fy, cx, cy = camera[0], camera[1], camera[2], camera[3]
-    values = np.zeros((len(centers_m), sectors, len(steps_m)))
+    sums = np.zeros((len(centers_m), sectors, len(steps_m)))
     middle, outwards = np.empty(3), np.empty(3)
     for t in range(len(centers_m)):
         for i in range(3):
             row = rotation[i]
             middle[i] = row[0] * centers_m[t, 0] + row[1] * centers_m[t, 1] + row[2] * levels_m[t] + translation_m[i]
+        right, ahead, far = middle[0], middle[1], middle[2]
         for a in range(sectors * per_sector):
             angle = (a + 0.5) / (sectors * per_sector) * 2.0 * math.pi - math.pi
             cos, sin = math.cos(angle), math.sin(angle)
             for i in range(3):
                 outwards[i] = rotation[i, 0] * cos + rotation[i, 1] * sin
+            more_right, more_ahead, farther = outwards[0], outwards[1], outwards[2]
+            ray = sums[t, a // per_sector]
             for b in range(len(steps_m)):
                 r = radii_m[t] + steps_m[b]
-                nearness = 1.0 / (middle[2] + r * outwards[2])
-                u = min(max(fx * (middle[0] + r * outwards[0]) * nearness + cx, 0.0), width - 1.001)
-                v = min(max(fy * (middle[1] + r * outwards[1]) * nearness + cy, 0.0), height - 1.001)
+                nearness = 1.0 / (far + r * farther)
+                u = min(max(fx * (right + r * more_right) * nearness + cx, 0.0), width - 1.001)
+                v = min(max(fy * (ahead + r * more_ahead) * nearness + cy, 0.0), height - 1.001)
                 i, j = int(v), int(u)
                 dv, du = v - i, u - j
                 upper = picture[i, j] * (1.0 - du) + picture[i, j + 1] * du
                 lower = picture[i + 1, j] * (1.0 - du) + picture[i + 1, j + 1] * du
-                values[t, a // per_sector, b] += (upper * (1.0 - dv) + lower * dv) / per_sector
-    return values
+                ray[b] += upper * (1.0 - dv) + lower * dv
+    return sums / per_sector

@@ -106,12 +106,14 @@ def find_tops(
     place = np.full((count, 3), -np.inf)
     second = np.full(count, -np.inf)
     for _ in range(PASSES):
-        if (best >= 0).all():
+        left = best < 0
+        left &= np.any([_may_hold(pictures[k][0], rack, tube, config) & may[k] for k, tube in enumerate(tubes)], axis=0)
+        if not left.any():
             break
         found = np.full((len(tubes), count, 3), -np.inf)
         for k, tube in enumerate(tubes):
             windows = _windows(rack, tube, config.reach_m)
-            found[k] = best_places(_top_score(*pictures[k], tube, config), *windows, may[k] & (best < 0), CLOSE, NEAR)
+            found[k] = best_places(_top_score(*pictures[k], tube, config), *windows, may[k] & left, CLOSE, NEAR)
             found[k, :, 1:] = found[k, :, 1:] * CELL_M - rack.outline_m / 2 - OUTSIDE_M
         ranked = np.sort(found[:, :, 0], axis=0)
         kind = found[:, :, 0].argmax(axis=0)
@@ -153,10 +155,34 @@ def _filled(
     return filled, off
 
 
+def _may_hold(
+    filled: NDArray[np.float32], rack: RackModel, tube: TubeModel, config: ProfileConfig
+) -> NDArray[np.bool_]:
+    """Slots (S,) in whose reach enough cells are filled for a type's least support, were they all of one top."""
+    low, high = _windows(rack, tube, config.reach_m)
+    reach = len(_top_kernels(tube)[0]) // 2
+    low, high = (np.clip(ends, 0, filled.shape) for ends in (low - reach, high + reach))
+    sums = cv2.integral(filled, sdepth=cv2.CV_64F)
+    count = sums[high[:, 0], high[:, 1]] - sums[low[:, 0], high[:, 1]] - sums[high[:, 0], low[:, 1]]
+    count += sums[low[:, 0], low[:, 1]]
+    return np.asarray(count > least_support(tube, config) * _top_kernels(tube)[1].sum())
+
+
 def _top_score(
     filled: NDArray[np.float32], off_m: NDArray[np.float32], tube: TubeModel, config: ProfileConfig
 ) -> NDArray[np.float32]:
     """Filled share of the top about every cell, less that of the ring around it and of the mouth in it."""
+    kernel, top = _top_kernels(tube)
+    score = _filter(filled, kernel)
+    if tube.is_open:
+        return score
+    mean_off_m = _filter(off_m, top) / np.maximum(_filter(filled, top), 1.0)
+    return np.asarray(score * np.exp(-0.5 * (mean_off_m / (2 * config.cap_height_m)) ** 2), np.float32)
+
+
+@lru_cache(maxsize=64)
+def _top_kernels(tube: TubeModel) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """What a picture is filtered with: weights of the cells about the middle of a top, and which ones are the top."""
     radius, mouth = top_radius_m(tube), mouth_radius_m(tube)
     reach = int(np.ceil((radius + 2e-3) / CELL_M))
     offsets = np.arange(-reach, reach + 1) * CELL_M
@@ -167,15 +193,11 @@ def _top_score(
     if mouth:
         core = r < mouth - 1.5e-3
         kernel = kernel - core / core.sum()
-    score = _filter(filled, kernel)
-    if tube.is_open:
-        return score
-    mean_off_m = _filter(off_m, top * 1.0) / np.maximum(_filter(filled, top * 1.0), 1.0)
-    return np.asarray(score * np.exp(-0.5 * (mean_off_m / (2 * config.cap_height_m)) ** 2), np.float32)
+    return kernel.astype(np.float32), top.astype(np.float32)
 
 
-def _filter(picture: NDArray[np.float32], kernel: FloatArray) -> NDArray[np.float32]:
-    return np.asarray(cv2.filter2D(picture, cv2.CV_32F, kernel.astype(np.float32), borderType=cv2.BORDER_CONSTANT))
+def _filter(picture: NDArray[np.float32], kernel: NDArray[np.float32]) -> NDArray[np.float32]:
+    return np.asarray(cv2.filter2D(picture, cv2.CV_32F, kernel, borderType=cv2.BORDER_CONSTANT))
 
 
 def _erase(
@@ -216,14 +238,10 @@ def without_overlaps(
     tubes: Sequence[TubeModel],
 ) -> NDArray[np.intp]:
     """Slots in order, without those whose top overlaps a better one or one that was found before: discs cannot."""
-    radius = np.array([top_radius_m(tube) for tube in tubes])[kind]
-    apart = np.hypot(*(place[:, None, 1:] - place[None, :, 1:]).T)
-    clear = apart > 0.75 * (radius[:, None] + radius)
-    kept = np.zeros(len(place), bool)
-    kept[taken] = True
-    new: list[int] = []
-    for slot in slots[np.argsort(-place[slots, 0], kind="stable")]:
-        if clear[slot, kept].all():
-            kept[slot] = True
-            new.append(int(slot))
-    return np.array(sorted(new), np.intp)
+    rows = np.concatenate([taken, slots[np.argsort(-place[slots, 0], kind="stable")]])
+    radius, at = np.array([top_radius_m(tube) for tube in tubes])[kind[rows]], place[rows, 1:]
+    clear = np.hypot(*(at[:, None] - at).T) > 0.75 * (radius[:, None] + radius)
+    kept = np.arange(len(rows)) < len(taken)
+    for row in range(len(taken), len(rows)):
+        kept[row] = clear[row, kept].all()
+    return np.sort(rows[len(taken) :][kept[len(taken) :]])
