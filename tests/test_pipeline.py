@@ -373,6 +373,12 @@ def test_a_box_of_a_known_class_leaves_its_slot_that_type_alone(seen):
     assert may[:, others].all()
 
 
+def test_the_better_of_two_boxes_of_a_slot_tells_its_type(seen):
+    may = told(seen, top_box("C5", TUBES[2], "white-cap"), top_box("C5", TUBES[1], "purple-cap"))
+    slot = [slot.name for slot in RACK.all_slots].index("C5")
+    assert may[:, slot].tolist() == [False, False, True]
+
+
 def test_boxes_that_say_no_type_leave_all(seen):
     nowhere = Detection("white-cap", 0.9, (np.nan,) * 4, "recorded", np.arange(3))
     assert told(seen) is None

@@ -99,15 +99,15 @@ def allowed_types(scene: Scene) -> NDArray[np.bool_] | None:
     if not boxes or scene.intrinsics is None or T_camera_rack is None:
         return None
     may = np.ones((len(scene.tubes), len(scene.rack.all_slots)), bool)
-    for box in boxes:
-        k = named[box.class_name]
-        top_m = np.column_stack(
-            [scene.rack.slot_centers_m, np.full(may.shape[1], scene.rack.floor_m + scene.tubes[k].height_m)]
-        )
-        pixels = scene.intrinsics.project(transform_points(T_camera_rack, top_m))
-        left, top, right, bottom = box.box_xyxy_px
-        distance = np.hypot(*(pixels - np.array([left + right, top + bottom]) / 2).T)
-        slot = int(np.argmin(distance))
-        if distance[slot] < max(right - left, bottom - top):
-            may[:, slot] = np.arange(len(scene.tubes)) == k
+    heights_m = scene.rack.floor_m + np.array([tube.height_m for tube in scene.tubes])
+    feet_m = np.column_stack([scene.rack.slot_centers_m, np.zeros(may.shape[1])])
+    tops_m = feet_m + np.array([0.0, 0.0, 1.0]) * heights_m[:, None, None]
+    pixels = scene.intrinsics.project(transform_points(T_camera_rack, tops_m))
+    kind = np.array([named[box.class_name] for box in boxes])
+    edges = np.array([box.box_xyxy_px for box in boxes], float)
+    distance = np.linalg.norm(pixels[kind] - (edges[:, None, :2] + edges[:, None, 2:]) / 2, axis=2)
+    near = distance.min(axis=1) < (edges[:, 2:] - edges[:, :2]).max(axis=1)
+    # The better of two boxes has the last word.
+    for k, slot in reversed([*zip(kind[near], distance.argmin(axis=1)[near], strict=True)]):
+        may[:, slot] = np.arange(len(scene.tubes)) == k
     return may

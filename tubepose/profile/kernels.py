@@ -19,10 +19,11 @@ def points_over(cloud_m, rotation, translation_m, lowest_m, highest_m, half_m):
     height, width = cloud_m.shape[0], cloud_m.shape[1]
     points = np.empty((height * width, 3))
     count = 0
+    up_x, up_y, up_z, above_m = rotation[2, 0], rotation[2, 1], rotation[2, 2], translation_m[2]
     for i in range(height):
         for j in range(width):
             x, y, z = cloud_m[i, j, 0], cloud_m[i, j, 1], cloud_m[i, j, 2]
-            up = rotation[2, 0] * x + rotation[2, 1] * y + rotation[2, 2] * z + translation_m[2]
+            up = up_x * x + up_y * y + up_z * z + above_m
             # False for NaN.
             if lowest_m < up < highest_m:
                 right = rotation[0, 0] * x + rotation[0, 1] * y + rotation[0, 2] * z + translation_m[0]

@@ -89,8 +89,6 @@ def _judge(
     """What one group is; None if it is too small to be anything."""
     (_, _), sides, _ = cv2.minAreaRect(cells.astype(np.float32))
     length_m, width_m = max(sides) * CELL_M, min(sides) * CELL_M
-    z = standing.points_m[rows, 2]
-    height_m = float(np.percentile(z, 95)) - rack.floor_m
     if length_m > LYING_PITCHES * pitch_m and width_m > 6e-3:
         return Leftover(
             None, f"lies across the rack: {length_m * 1e3:.0f} x {width_m * 1e3:.0f} mm seen from above", rows
@@ -101,8 +99,10 @@ def _judge(
     area_m2 = len(cells) * CELL_M**2
     if area_m2 < CORE_SHARE * np.pi * (0.3 * pitch_m) ** 2 or distance[slot] > 0.6 * pitch_m:
         return None
+    z = standing.points_m[rows, 2]
     if np.mean(np.abs(z - np.median(z)) < LEVEL_M) < LEVEL_SHARE:
         return None
+    height_m = float(np.percentile(z, 95)) - rack.floor_m
     if slot in taken:
         if area_m2 < np.pi * (0.3 * pitch_m) ** 2:
             return None
