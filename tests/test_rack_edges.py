@@ -179,6 +179,12 @@ def test_a_rough_look_at_some_of_the_points_goes_on_with_all_of_them():
         assert millimetres < 0.05
 
 
+def test_a_scan_of_less_than_a_rack_is_refused():
+    part = TOP[np.abs(TOP[:, :2]).max(axis=1) < 0.02]
+    assert len(part) > 500
+    assert register_rack(transform_points(T_TRUE, part), SOFT, CONFIG).status is not RackStatus.OK
+
+
 def test_a_spacing_that_is_not_known_is_not_called_coarse():
     assert too_coarse(float("nan"), SOFT, CONFIG.rack) == ""
     assert "2.00 mm apart" in too_coarse(2e-3, SOFT, CONFIG.rack)
