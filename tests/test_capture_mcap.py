@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import contextlib
 import struct
 from dataclasses import replace
 from pathlib import Path
@@ -573,6 +574,23 @@ def test_other_content_is_no_mcap(tmp_path):
         read_all(tmp_path / "a.mcap")
 
 
+def with_definition(
+    path: Path,
+    definition: bytes,
+    schema: str = POINT_CLOUD,
+    encoding: str = "ros2msg",
+    message: bytes = b"\x00\x01\x00\x00" + bytes(200),
+) -> Path:
+    """A file of one message on /t, whose schema holds this text."""
+    with path.open("wb") as stream:
+        writer = RawWriter(stream)
+        writer.start()
+        channel = writer.register_channel("/t", "cdr", writer.register_schema(schema, encoding, definition))
+        writer.add_message(channel, 1, message, 1)
+        writer.finish()
+    return path
+
+
 @pytest.mark.parametrize(
     ("schema", "encoding", "message"),
     [
@@ -584,14 +602,42 @@ def test_other_content_is_no_mcap(tmp_path):
 )
 def test_messages_of_other_kinds_are_refused_by_name(tmp_path, schema, encoding, message):
     definition = writing._DEFINITIONS.get(schema, "string data").encode()
-    with (tmp_path / "a.mcap").open("wb") as stream:
-        writer = RawWriter(stream)
-        writer.start()
-        channel = writer.register_channel("/t", "cdr", writer.register_schema(schema, encoding, definition))
-        writer.add_message(channel, 1, b"\x00\x01\x00\x00" + b"\xff" * 20, 1)
-        writer.finish()
+    path = with_definition(tmp_path / "a.mcap", definition, schema, encoding, b"\x00\x01\x00\x00" + b"\xff" * 20)
     with pytest.raises(CaptureError, match=message):
-        read_all(tmp_path / "a.mcap")
+        read_all(path)
+
+
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [
+        ("uint32 height", "uint32 heigh["),  # a name that is none
+        ("uint32 width", "uint32 point step"),  # a value that is no number
+        ("uint8[] data", "uint8[data"),
+        ("bool is_dense", "="),
+        ("string frame_id", "wstring frame_id\xff"),
+    ],
+)
+def test_a_damaged_definition_is_told_in_one_line(tmp_path, capsys, old, new):
+    text = writing._DEFINITIONS[POINT_CLOUD]
+    assert old in text
+    path = with_definition(tmp_path / "a.mcap", text.replace(old, new).encode("latin-1"))
+    with pytest.raises(
+        CaptureError, match=r"a\.mcap: the definition of .*PointCloud2 .* for /t cannot be read: "
+    ) as told:
+        read_all(path)
+    assert "\n" not in str(told.value)
+    assert capsys.readouterr() == ("", "")
+
+
+@settings(max_examples=60)
+@given(st.integers(0, 10_000), st.integers(0, 12), st.binary(max_size=8))
+def test_any_definition_gives_frames_or_one_line(tmp_path_factory, start, length, junk):
+    text = writing._DEFINITIONS[POINT_CLOUD].encode()
+    start %= len(text)
+    damaged = text[:start] + junk + text[start + length :]
+    path = with_definition(tmp_path_factory.mktemp("definition") / "a.mcap", damaged)
+    with contextlib.suppress(CaptureError):
+        read_all(path)
 
 
 def test_unreadable_encoding_and_missing_fields_are_named(tmp_path):

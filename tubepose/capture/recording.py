@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import struct
-from collections.abc import Collection, Iterator
+from collections.abc import Callable, Collection, Iterator
+from contextlib import redirect_stderr
 from dataclasses import dataclass
+from io import StringIO
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +25,7 @@ METADATA_NAME = "tubepose"
 _READ = (POINT_CLOUD, IMAGE, COMPRESSED_IMAGE, CAMERA_INFO)
 # What a cut or damaged file makes mcap and its decompressors raise (lz4: RuntimeError; checksums and text: ValueError).
 _BROKEN = (McapError, zstandard.ZstdError, struct.error, ValueError, RuntimeError)
-# Decoding one message: lengths and text that do not fit, types that its schema does not define.
+# Decoding one message: lengths and text that do not fit, types that are not read.
 _UNDECODABLE = (McapError, struct.error, ValueError, IndexError, NotImplementedError)
 
 
@@ -137,20 +139,33 @@ _NO_SCHEMA = Schema(id=0, name="messages without a schema", encoding="", data=b"
 
 
 def _decode(factory: DecoderFactory, entry: _Entry, path: Path) -> Any:
-    schema, channel = entry.schema, entry.channel
-    decode = factory.decoder_for(channel.message_encoding, schema)
-    if decode is None:
-        raise CaptureError(
-            f"{path}: {channel.topic} is encoded as {channel.message_encoding} with a {schema.encoding} schema; "
-            "expected cdr with ros2msg, as 'ros2 bag record -s mcap' writes it"
-        )
+    decode = _decoder(factory, entry, path)
     try:
         return decode(entry.message.data)
     except _UNDECODABLE as problem:
         text = " ".join(str(problem).split())
         raise CaptureError(
-            f"{path}: a message of {channel.topic} is not the {schema.name} it claims to be: {text}"
+            f"{path}: a message of {entry.channel.topic} is not the {entry.schema.name} it claims to be: {text}"
         ) from None
+
+
+def _decoder(factory: DecoderFactory, entry: _Entry, path: Path) -> Callable[[bytes], Any]:
+    schema, channel = entry.schema, entry.channel
+    try:
+        with redirect_stderr(StringIO()):  # the parser of definitions prints, too
+            decode = factory.decoder_for(channel.message_encoding, schema)
+    except Exception as problem:  # noqa: BLE001  # it raises a dozen kinds, some of them classes of its own
+        text = " ".join(str(problem).split())
+        raise CaptureError(
+            f"{path}: the definition of {schema.name} that the file holds for {channel.topic} cannot be read: {text}; "
+            "copy or record the file again"
+        ) from None
+    if decode is None:
+        raise CaptureError(
+            f"{path}: {channel.topic} is encoded as {channel.message_encoding} with a {schema.encoding} schema; "
+            "expected cdr with ros2msg, as 'ros2 bag record -s mcap' writes it"
+        )
+    return decode
 
 
 def _stamp_ns(message: Message) -> int | None:
