@@ -121,9 +121,8 @@ def _with_line(
     walls_mm = lattice.walls_mm(np.array(rack.outline_mm), counts)
     counts = counts + np.abs(side)
     grown = lattice.rack(int(counts[1]), int(counts[0]), walls_mm)
-    return grown, T_camera_rack @ make_transform(
-        np.eye(3), np.array([*(side * np.array(lattice.pitch_mm) * 5e-4), 0.0])
-    )
+    half_step_m = side * np.array(lattice.pitch_mm) * 5e-4
+    return grown, T_camera_rack @ make_transform(np.eye(3), np.array([*half_step_m, 0.0]))
 
 
 def _racks(points_m: FloatArray, lattice: SlotLattice, config: Config) -> Iterator[tuple[FloatArray, RackModel]]:

@@ -38,12 +38,13 @@ class Definition(BaseModel):
         return hash((type(self), *(getattr(self, name) for name in type(self).model_fields)))
 
     def __copy__(self) -> Self:
-        """A copy that may be changed: `model_copy` makes its changes to one."""
+        """A copy that may be changed, as `model_copy` does: without what was computed of this one."""
         copied = super().__copy__()
-        copied.__dict__.pop("_hash", None)
+        for name in copied.__dict__.keys() - type(self).model_fields.keys():
+            del copied.__dict__[name]
         return copied
 
     def __getstate__(self) -> dict[Any, Any]:
-        """What is sent to another process, in which texts have other hashes."""
+        """What is sent to another process, in which texts have other hashes: nothing that was computed."""
         state = super().__getstate__()
-        return {**state, "__dict__": {name: value for name, value in state["__dict__"].items() if name != "_hash"}}
+        return {**state, "__dict__": {name: state["__dict__"][name] for name in type(self).model_fields}}
