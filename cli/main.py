@@ -49,5 +49,5 @@ def run() -> None:
     try:
         app()
     except TubePoseError as problem:
-        print(f"error: {' '.join(str(problem).split())}", file=sys.stderr)
+        print(f"error: {problem}", file=sys.stderr)
         sys.exit(1)

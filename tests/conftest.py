@@ -1,4 +1,8 @@
-"""What all tests share: no example is timed, as machines differ. What several share: one small simulated session."""
+"""What all tests share, and one small simulated session.
+
+Property tests try the same examples in every run, so that a change is not failed for what another one left; none is
+timed, as machines differ. `pytest --hypothesis-profile search` tries new ones.
+"""
 
 from __future__ import annotations
 
@@ -8,8 +12,9 @@ import pytest
 from commands import tubepose
 from hypothesis import settings
 
-settings.register_profile("untimed", deadline=None)
-settings.load_profile("untimed")
+settings.register_profile("same", deadline=None, derandomize=True)
+settings.register_profile("search", deadline=None)
+settings.load_profile("same")
 
 SMALL_RACK = "round-10ml-3x4"
 SMALL_TUBES = ("blood-16x100", "chen2023-tube-3")

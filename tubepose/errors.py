@@ -7,7 +7,15 @@ Bad data inside one frame is not an error but a status in the tables; a broken i
 
 
 class TubePoseError(Exception):
-    """Base of all errors that a user can correct."""
+    """Base of all errors that a user can correct.
+
+    The text is one line whatever it quotes: a break and the white space around it become one space, and characters
+    that do not print (a damaged file's) are written as escapes.
+    """
+
+    def __init__(self, text: str) -> None:
+        line = " ".join(part.strip() for part in text.splitlines())
+        super().__init__("".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in line))
 
 
 class LabwareError(TubePoseError):

@@ -36,7 +36,10 @@ def decode(data: bytes, where: str) -> NDArray[np.generic]:
     """
     cut = data.startswith(_PNG) and b"IEND" not in data
     flags = cv2.IMREAD_UNCHANGED | cv2.IMREAD_IGNORE_ORIENTATION
-    pixels = None if cut or not data else cv2.imdecode(np.frombuffer(data, np.uint8), flags)
+    try:
+        pixels = None if cut or not data else cv2.imdecode(np.frombuffer(data, np.uint8), flags)
+    except cv2.error:  # a header that claims more pixels than OpenCV opens
+        pixels = None
     if pixels is None:
         raise CaptureError(
             f"{where}: {'truncated' if cut else 'cannot be decoded'}; expected a whole PNG or JPEG image"

@@ -13,9 +13,10 @@ from numpy.typing import NDArray
 
 from tubepose.capture.description import Unit
 from tubepose.capture.frame import CameraIntrinsics, RgbdFrame
+from tubepose.capture.message_types import POINT_CLOUD
 from tubepose.capture.recording import Recording, StampedMessage, index_recording, read_messages
 from tubepose.capture.registration import METRES_PER_UNIT, clean_cloud, project_cloud
-from tubepose.capture.ros import POINT_CLOUD, camera_of, cloud_arrays, depth_image, picture
+from tubepose.capture.ros import camera_of, cloud_arrays, depth_image, picture
 from tubepose.capture.topics import Chosen, Topic, TopicChoice, choose_topics
 from tubepose.errors import CaptureError
 from tubepose.transforms import FloatArray

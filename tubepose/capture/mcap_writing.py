@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 from tubepose.capture.compressed_depth import DEPTH_STEP_M, FORMAT, encode_compressed_depth
 from tubepose.capture.frame import CameraIntrinsics, RgbdFrame
 from tubepose.capture.images import encode_jpeg, encode_png
+from tubepose.capture.message_types import CAMERA_INFO, COMPRESSED_IMAGE, DEFINITIONS, IMAGE, POINT_CLOUD
 from tubepose.capture.recording import METADATA_NAME
-from tubepose.capture.ros import CAMERA_INFO, COMPRESSED_IMAGE, IMAGE, POINT_CLOUD
 from tubepose.capture.writing import is_depth_image
 from tubepose.errors import CaptureError
 
@@ -30,63 +30,6 @@ _FRAME_ID = "camera_color_optical_frame"
 _POINT_BYTES = 12
 # A float32 depth is exact to this, metres; a cloud that is farther from its lines of sight is not written as depth.
 _DEPTH_TOLERANCE_M = 1.0e-6
-
-_RULE = "=" * 80
-_HEADER = f"""
-{_RULE}
-MSG: std_msgs/Header
-builtin_interfaces/Time stamp
-string frame_id
-{_RULE}
-MSG: builtin_interfaces/Time
-int32 sec
-uint32 nanosec
-"""
-_DEFINITIONS = {
-    POINT_CLOUD: f"""std_msgs/Header header
-uint32 height
-uint32 width
-sensor_msgs/PointField[] fields
-bool is_bigendian
-uint32 point_step
-uint32 row_step
-uint8[] data
-bool is_dense
-{_RULE}
-MSG: sensor_msgs/PointField
-string name
-uint32 offset
-uint8 datatype
-uint32 count{_HEADER}""",
-    IMAGE: f"""std_msgs/Header header
-uint32 height
-uint32 width
-string encoding
-uint8 is_bigendian
-uint32 step
-uint8[] data{_HEADER}""",
-    COMPRESSED_IMAGE: f"""std_msgs/Header header
-string format
-uint8[] data{_HEADER}""",
-    CAMERA_INFO: f"""std_msgs/Header header
-uint32 height
-uint32 width
-string distortion_model
-float64[] d
-float64[9] k
-float64[9] r
-float64[12] p
-uint32 binning_x
-uint32 binning_y
-sensor_msgs/RegionOfInterest roi
-{_RULE}
-MSG: sensor_msgs/RegionOfInterest
-uint32 x_offset
-uint32 y_offset
-uint32 height
-uint32 width
-bool do_rectify{_HEADER}""",
-}
 
 
 @dataclass(frozen=True, slots=True)
@@ -133,7 +76,7 @@ def _write(
     stream: Any, path: Path, frames: Iterable[RgbdFrame], as_depth: bool, compression: _Compression | None
 ) -> None:
     writer = Writer(stream)
-    schemas = {name: writer.register_msgdef(name, text) for name, text in _DEFINITIONS.items()}
+    schemas = {name: writer.register_msgdef(name, text) for name, text in DEFINITIONS.items()}
     for number, frame in enumerate(frames):
         if number == 0:
             noted = {"sensor": frame.sensor, "simulated": "true" if frame.simulated else "false"}

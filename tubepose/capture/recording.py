@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Callable, Collection, Iterator
-from contextlib import redirect_stderr
 from dataclasses import dataclass
-from io import StringIO
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -14,15 +13,15 @@ import zstandard
 from mcap.exceptions import EndOfFile, InvalidMagic, McapError, RecordLengthLimitExceeded
 from mcap.records import Channel, Message, Metadata, Schema
 from mcap.stream_reader import StreamReader
+from mcap.well_known import MessageEncoding, SchemaEncoding
 from mcap_ros2.decoder import DecoderFactory
 
-from tubepose.capture.ros import CAMERA_INFO, COMPRESSED_IMAGE, IMAGE, POINT_CLOUD
+from tubepose.capture.message_types import DEFINITIONS
 from tubepose.capture.topics import Topic
 from tubepose.errors import CaptureError
 
 METADATA_NAME = "tubepose"
 
-_READ = (POINT_CLOUD, IMAGE, COMPRESSED_IMAGE, CAMERA_INFO)
 # What a cut or damaged file makes mcap and its decompressors raise (lz4: RuntimeError; checksums and text: ValueError).
 _BROKEN = (McapError, zstandard.ZstdError, struct.error, ValueError, RuntimeError)
 # Decoding one message: lengths and text that do not fit, types that are not read.
@@ -79,17 +78,16 @@ def index_recording(path: Path) -> Recording:
     metadata: dict[str, str] = {}
     others: set[str] = set()
     broken: Exception | None = None
-    decoders = DecoderFactory()
     try:
         for entry in _entries(path):
             if isinstance(entry, Metadata):
                 metadata |= entry.metadata if entry.name == METADATA_NAME else {}
-            elif entry.schema.name not in _READ:
+            elif entry.schema.name not in DEFINITIONS:
                 others.add(entry.schema.name)
             else:
                 name = entry.channel.topic
                 if name not in topics:
-                    topics[name] = Topic(name, entry.schema.name, _decode(decoders, entry, path))
+                    topics[name] = Topic(name, entry.schema.name, _decode(entry, path))
                 topics[name].stamps_ns.append(_stamp_ns(entry.message))
     except InvalidMagic:
         raise CaptureError(f"{path}: expected an MCAP file, found other content; check the path") from None
@@ -102,11 +100,10 @@ def index_recording(path: Path) -> Recording:
 
 def read_messages(path: Path, topics: Collection[str]) -> Iterator[StampedMessage]:
     """Every whole message of some topics in file order; a break just ends them (`index_recording` saw it)."""
-    decoders = DecoderFactory()
     try:
         for entry in _entries(path):
             if isinstance(entry, _Entry) and entry.channel.topic in topics:
-                fields = _decode(decoders, entry, path)
+                fields = _decode(entry, path)
                 yield StampedMessage(entry.channel.topic, _stamp_ns(entry.message), fields)
     except _BROKEN:
         return
@@ -138,34 +135,28 @@ def _entries(path: Path) -> Iterator[_Entry | Metadata]:
 _NO_SCHEMA = Schema(id=0, name="messages without a schema", encoding="", data=b"")
 
 
-def _decode(factory: DecoderFactory, entry: _Entry, path: Path) -> Any:
-    decode = _decoder(factory, entry, path)
-    try:
-        return decode(entry.message.data)
-    except _UNDECODABLE as problem:
-        text = " ".join(str(problem).split())
-        raise CaptureError(
-            f"{path}: a message of {entry.channel.topic} is not the {entry.schema.name} it claims to be: {text}"
-        ) from None
-
-
-def _decoder(factory: DecoderFactory, entry: _Entry, path: Path) -> Callable[[bytes], Any]:
+def _decode(entry: _Entry, path: Path) -> Any:
+    """Fields of a message of a type that is read, by our own definition of it."""
     schema, channel = entry.schema, entry.channel
-    try:
-        with redirect_stderr(StringIO()):  # the parser of definitions prints, too
-            decode = factory.decoder_for(channel.message_encoding, schema)
-    except Exception as problem:  # noqa: BLE001  # it raises a dozen kinds, some of them classes of its own
-        text = " ".join(str(problem).split())
+    if channel.message_encoding != MessageEncoding.CDR:
         raise CaptureError(
-            f"{path}: the definition of {schema.name} that the file holds for {channel.topic} cannot be read: {text}; "
-            "copy or record the file again"
-        ) from None
-    if decode is None:
-        raise CaptureError(
-            f"{path}: {channel.topic} is encoded as {channel.message_encoding} with a {schema.encoding} schema; "
-            "expected cdr with ros2msg, as 'ros2 bag record -s mcap' writes it"
+            f"{path}: {channel.topic} is encoded as {channel.message_encoding or 'nothing'}; "
+            "expected cdr, as 'ros2 bag record -s mcap' writes it"
         )
-    return decode
+    try:
+        return _decoder(schema.name)(entry.message.data)
+    except _UNDECODABLE as problem:
+        raise CaptureError(
+            f"{path}: a message of {channel.topic} is not the {schema.name} it claims to be: {problem}"
+        ) from None
+
+
+@cache
+def _decoder(name: str) -> Callable[[bytes], Any]:
+    schema = Schema(id=1, name=name, encoding=SchemaEncoding.ROS2, data=DEFINITIONS[name].encode())
+    decoder = DecoderFactory().decoder_for(MessageEncoding.CDR, schema)
+    assert decoder is not None, f"no decoder of {name}"
+    return decoder
 
 
 def _stamp_ns(message: Message) -> int | None:

@@ -11,14 +11,10 @@ from numpy.typing import NDArray
 from tubepose.capture.compressed_depth import decode_compressed_depth, is_compressed_depth
 from tubepose.capture.frame import CameraIntrinsics
 from tubepose.capture.images import decode, to_picture
+from tubepose.capture.message_types import COMPRESSED_IMAGE
 from tubepose.capture.registration import depth_to_metres
 from tubepose.errors import CaptureError
 from tubepose.transforms import FloatArray
-
-POINT_CLOUD = "sensor_msgs/msg/PointCloud2"
-IMAGE = "sensor_msgs/msg/Image"
-COMPRESSED_IMAGE = "sensor_msgs/msg/CompressedImage"
-CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
 
 # Metres per count of the two encodings that hold depth (REP 118).
 DEPTH_ENCODINGS = {"16UC1": 1.0e-3, "32FC1": 1.0}
@@ -137,10 +133,10 @@ def camera_of(info: Any, *, rectified: bool) -> CameraIntrinsics | None:
     matrix = (
         np.array(info.p, dtype=float).reshape(3, 4)[:, :3] if rectified else np.array(info.k, dtype=float).reshape(3, 3)
     )
-    if matrix[0, 0] <= 0 or matrix[1, 1] <= 0 or info.width == 0 or info.height == 0:
+    if not np.isfinite(matrix).all() or min(matrix[0, 0], matrix[1, 1], info.width, info.height) <= 0:
         return None
     distortion = np.array(info.d, dtype=float)
-    if not rectified and distortion.any() and _distortion_px(info, matrix, distortion) > _MAX_DISTORTION_PX:
+    if not (rectified or not distortion.any() or _distortion_px(info, matrix, distortion) <= _MAX_DISTORTION_PX):
         return None
     (fx, _, cx), (_, fy, cy) = matrix[0].tolist(), matrix[1].tolist()
     return CameraIntrinsics(int(info.width), int(info.height), fx, fy, cx, cy)

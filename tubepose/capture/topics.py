@@ -7,7 +7,8 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from tubepose.capture.compressed_depth import is_compressed_depth
-from tubepose.capture.ros import CAMERA_INFO, COMPRESSED_IMAGE, DEPTH_ENCODINGS, IMAGE, POINT_CLOUD
+from tubepose.capture.message_types import CAMERA_INFO, COMPRESSED_IMAGE, IMAGE, POINT_CLOUD
+from tubepose.capture.ros import DEPTH_ENCODINGS
 from tubepose.errors import CaptureError
 
 # What image_transport adds to a topic's name for its compressed twin.

@@ -212,4 +212,4 @@ def _read_text(path: Path) -> str:
     except FileNotFoundError:
         raise DetectorError(f"{path}: no such file") from None
     except (OSError, UnicodeDecodeError) as problem:
-        raise DetectorError(f"{path}: cannot be read as text: {' '.join(str(problem).split())}") from None
+        raise DetectorError(f"{path}: cannot be read as text: {problem}") from None

@@ -68,7 +68,7 @@ class YoloSession:
         try:
             outputs = self.runtime.run(None, {self.runtime.get_inputs()[0].name: tensor})
         except _runtime_errors() as problem:
-            raise DetectorError(f"{self.path}: the network fails: {_one_line(problem)}; export it again") from None
+            raise DetectorError(f"{self.path}: the network fails: {problem}; export it again") from None
         return [np.asarray(output) for output in outputs]
 
 
@@ -104,7 +104,7 @@ def _start_runtime(path: Path, providers: Sequence[str], threads: int | None) ->
         import onnxruntime
     except ImportError as problem:
         raise DetectorError(
-            f"{path}: onnxruntime cannot be imported ({_one_line(problem)}); install it with 'pip install onnxruntime'"
+            f"{path}: onnxruntime cannot be imported ({problem}); install it with 'pip install onnxruntime'"
         ) from None
     asked, available = list(providers), onnxruntime.get_available_providers()
     _require_providers(path, asked, available)
@@ -115,7 +115,7 @@ def _start_runtime(path: Path, providers: Sequence[str], threads: int | None) ->
     try:
         runtime = onnxruntime.InferenceSession(str(path), sess_options=options, providers=asked)
     except _runtime_errors() as problem:
-        raise DetectorError(f"{path}: no ONNX model that onnxruntime can load: {_one_line(problem)}") from None
+        raise DetectorError(f"{path}: no ONNX model that onnxruntime can load: {problem}") from None
     # A provider whose driver is missing is dropped in silence and the CPU takes over.
     _require_providers(path, asked, runtime.get_providers())
     return runtime
@@ -136,10 +136,6 @@ def _runtime_errors() -> tuple[type[Exception], ...]:
 
     own = [item for item in vars(state).values() if isinstance(item, type) and issubclass(item, Exception)]
     return (*own, RuntimeError, ValueError)
-
-
-def _one_line(problem: BaseException) -> str:
-    return " ".join(str(problem).split())
 
 
 def _read_metadata(path: Path, entries: dict[str, str]) -> ModelMetadata:

@@ -31,7 +31,7 @@ def read_yaml(path: Path, error: type[TubePoseError]) -> dict[str, Any]:
     except (OSError, UnicodeDecodeError) as problem:
         raise error(f"{path}: cannot be read: {problem}") from None
     except yaml.YAMLError as problem:
-        raise error(f"{path}: not valid YAML: {' '.join(str(problem).split())}") from None
+        raise error(f"{path}: not valid YAML: {problem}") from None
     if not isinstance(data, dict):
         found = "nothing: the file is empty" if data is None else f"a {type(data).__name__}"
         raise error(f"{path}: expected a mapping of keys to values, found {found}")

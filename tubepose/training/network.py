@@ -36,9 +36,8 @@ def require_packages() -> None:
         try:
             importlib.import_module(name)
         except (ImportError, RuntimeError) as problem:
-            found = " ".join(str(problem).split())
             raise DetectorError(
-                f"training needs the package of '{name}', which cannot be imported ({found}); "
+                f"training needs the package of '{name}', which cannot be imported ({problem}); "
                 "install it with: pip install 'tubepose[train]'"
             ) from None
 
