@@ -25,7 +25,7 @@ from tubepose.config import Config, RackConfig
 from tubepose.labware import RackModel, load_rack
 from tubepose.provenance import pinned_threads
 from tubepose.rack import RackPose, RackStatus, register_rack
-from tubepose.rack_naming import name_rack
+from tubepose.rack.naming import name_rack
 from tubepose.simulation import read_exact_truth
 from tubepose.transforms import HALF_TURN, FloatArray, invert_transform, make_transform, transform_points
 

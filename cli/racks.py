@@ -11,7 +11,7 @@ if TYPE_CHECKING:
     from tubepose.capture.source import Capture
     from tubepose.config import Config
     from tubepose.labware import RackModel
-    from tubepose.rack_lattice import SlotLattice
+    from tubepose.rack.lattice import SlotLattice
 
 # Stands in a job until its rack is found.
 UNKNOWN = "chen2023-soft-5x10"
@@ -58,7 +58,7 @@ def read_rack(name: str | None, pitch: str | None, slot: str | None) -> RackChoi
 def _lattice(pitch: str, slot: str) -> SlotLattice:
     from tubepose.errors import ConfigError
     from tubepose.labware import SlotShape
-    from tubepose.rack_lattice import SlotLattice
+    from tubepose.rack.lattice import SlotLattice
 
     shape, _, size = slot.partition(":")
     if shape not in ("square", "round"):
@@ -91,8 +91,8 @@ def find_rack(capture: Capture, choice: RackChoice, config: Config) -> tuple[Rac
     """
     from tubepose.errors import CaptureError
     from tubepose.provenance import pinned_threads
-    from tubepose.rack_grid import register_grid
-    from tubepose.rack_naming import name_rack
+    from tubepose.rack.grid import register_grid
+    from tubepose.rack.naming import name_rack
 
     frame = next(iter(capture.frames()), None)
     if frame is None:

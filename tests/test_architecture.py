@@ -14,7 +14,7 @@ CLI = ROOT / "cli"
 
 # Everyone may use these; they use nothing of ours but one another.
 BASE = {"errors", "transforms"}
-STAGES = {"rack", "rack_acceptance", "slots", "tube", "profile", "pipeline", "baselines", "rivals", "detection"}
+STAGES = {"rack", "slots", "tube", "profile", "pipeline", "baselines", "rivals", "detection"}
 
 # Part of the library -> the other parts that it may import (BASE goes without saying).
 ALLOWED: dict[str, set[str]] = {
@@ -24,62 +24,9 @@ ALLOWED: dict[str, set[str]] = {
     "capture": {"labware"},
     "config": {"labware"},
     "preprocessing": {"config", "labware"},
-    "detection": {
-        "capture",
-        "config",
-        "labware",
-        "preprocessing",
-        "rack_edges",
-        "rack_fit",
-        "rack_pose",
-        "rack_search",
-    },
+    "detection": {"capture", "config", "labware", "preprocessing", "rack"},
     "compiled": set(),
-    "rack_kernels": {"compiled"},
-    "rack_view_kernels": {"compiled", "rack_kernels"},
-    "rack_field": {"labware", "rack_kernels"},
-    "rack_search": {"config", "labware", "rack_field", "rack_view_kernels"},
-    "rack_fit": {"labware", "rack_field", "rack_kernels", "rack_view_kernels"},
-    "rack_acceptance": {"config", "labware"},
-    "rack_evidence": {"labware", "rack_field", "rack_fit", "rack_view_kernels"},
-    "rack_agreement": {
-        "config",
-        "labware",
-        "rack_evidence",
-        "rack_field",
-        "rack_fit",
-        "rack_kernels",
-        "rack_view_kernels",
-    },
-    "rack_pose": {"capture", "config", "labware"},
-    "rack_looks": {"labware", "rack_evidence", "rack_fit", "rack_pose", "rack_view_kernels"},
-    "rack_edges": {
-        "capture",
-        "config",
-        "labware",
-        "preprocessing",
-        "rack_acceptance",
-        "rack_agreement",
-        "rack_field",
-        "rack_fit",
-        "rack_looks",
-        "rack_pose",
-        "rack_search",
-    },
-    "rack_naming": {"capture", "config", "labware", "rack_edges", "rack_pose", "rack_search"},
-    "rack_lattice": {"config", "labware", "rack_edges"},
-    "rack_grid": {
-        "capture",
-        "config",
-        "labware",
-        "rack_edges",
-        "rack_fit",
-        "rack_lattice",
-        "rack_pose",
-        "rack_search",
-    },
-    "rack_obb": {"capture", "config", "labware", "preprocessing", "rack_acceptance", "rack_pose"},
-    "rack": {"capture", "config", "labware", "preprocessing", "rack_acceptance", "rack_edges", "rack_obb", "rack_pose"},
+    "rack": {"capture", "compiled", "config", "labware", "preprocessing"},
     "slots": {"config", "labware", "preprocessing", "detection", "rack"},
     "tube": {"config", "labware", "preprocessing", "slots"},
     "profile": {"capture", "compiled", "config", "labware", "preprocessing", "tube"},
@@ -199,6 +146,22 @@ def test_the_table_itself_has_no_cycle() -> None:
         assert ready, f"cycle among {sorted(left)}"
         done |= set(ready)
         left = {part: needs for part, needs in left.items() if part not in done}
+
+
+def test_no_circle_of_modules() -> None:
+    """Within a part as well; a package's `__init__` is for those outside of it."""
+    paths = {
+        ".".join(p.relative_to(ROOT).with_suffix("").parts): p for p in LIBRARY.rglob("*.py") if p.stem != "__init__"
+    }
+    left = {}
+    for name, path in paths.items():
+        used = imported(path.read_text(), package_of(path))
+        left[name] = {other for other in paths if other in used or any(u.startswith(f"{other}.") for u in used)}
+    while left:
+        ready = [name for name, needs in left.items() if not needs & left.keys()]
+        assert ready, f"cycle among {sorted(left)}"
+        for name in ready:
+            del left[name]
 
 
 def test_ground_truth_shares_nothing_with_the_estimators() -> None:

@@ -6,13 +6,12 @@ import numpy as np
 import pytest
 import scenes
 
-from tubepose import rack_edges, rack_looks
 from tubepose.config import Config
 from tubepose.labware import load_rack, load_tube
-from tubepose.rack import RackStatus, register_rack
-from tubepose.rack_acceptance import too_coarse
-from tubepose.rack_field import top_field
-from tubepose.rack_fit import filled, refine
+from tubepose.rack import RackStatus, edges, looks, register_rack
+from tubepose.rack.acceptance import too_coarse
+from tubepose.rack.field import top_field
+from tubepose.rack.fit import filled, refine
 from tubepose.transforms import HALF_TURN, invert_transform, make_transform, transform_points
 
 CONFIG = Config()
@@ -134,12 +133,12 @@ def test_the_covariance_holds_what_repeated_scans_do():
 @pytest.mark.parametrize("slots_off", [(0, 0), (2, 0), (-1, 1)])
 def test_a_start_some_slots_off_is_moved_before_it_is_refined(monkeypatch, slots_off):
     fits = []
-    refine = rack_edges.refine
-    monkeypatch.setattr(rack_edges, "refine", lambda *args: fits.append(1) or refine(*args))
+    refine = edges.refine
+    monkeypatch.setattr(edges, "refine", lambda *args: fits.append(1) or refine(*args))
     assert SOFT.grid is not None
     off = make_transform(np.eye(3), np.array([*(np.multiply(slots_off, SOFT.grid.pitch_mm) * 1e-3), 0.0]))
     points = transform_points(T_TRUE, hidden_by(TOP, SOFT.all_slots[5:30], 9e-3))
-    found = rack_edges.register_at(points, T_TRUE @ off, SOFT, CONFIG.rack)
+    found = edges.register_at(points, T_TRUE @ off, SOFT, CONFIG.rack)
     degrees, millimetres = error(found.fit)
     assert degrees < 0.05
     assert millimetres < 0.05
@@ -150,12 +149,12 @@ def test_a_start_some_slots_off_is_moved_before_it_is_refined(monkeypatch, slots
 @pytest.mark.parametrize("every", [1, 3])
 def test_a_place_with_much_less_evidence_than_an_accepted_one_is_not_refined(every):
     points = transform_points(T_TRUE, hidden_by(TOP, SOFT.all_slots[5:30], 9e-3))
-    best = rack_edges.register_at(points, T_TRUE, SOFT, CONFIG.rack)
+    best = edges.register_at(points, T_TRUE, SOFT, CONFIG.rack)
     assert best.reason == ""
 
     def no_rival(shift_m, found):
         T = T_TRUE @ make_transform(np.eye(3), np.array([shift_m, 0.0, 0.0]))
-        return rack_edges._no_rival(*rack_looks.look_at(points[::every], T, SOFT), every, found, SOFT, CONFIG.rack)
+        return edges._no_rival(*looks.look_at(points[::every], T, SOFT), every, found, SOFT, CONFIG.rack)
 
     half_a_rack = 5 * SOFT.grid.pitch_mm[0] * 1e-3
     assert no_rival(half_a_rack, [best])
@@ -167,7 +166,7 @@ def test_a_place_with_much_less_evidence_than_an_accepted_one_is_not_refined(eve
 def test_a_rough_look_at_some_of_the_points_goes_on_with_all_of_them():
     points = transform_points(T_TRUE, TOP)
     T = T_TRUE @ make_transform(np.eye(3), np.array([1e-3, -1e-3, 0.0]))
-    few, all_of_them = (rack_looks.look_at(points[::every], T, SOFT)[1] for every in (5, 1))
+    few, all_of_them = (looks.look_at(points[::every], T, SOFT)[1] for every in (5, 1))
     gone_on = filled(few, points, SOFT)
     assert len(few.kept_m) < 0.3 * len(all_of_them.kept_m)
     assert len(gone_on.kept_m) == pytest.approx(len(all_of_them.kept_m), rel=0.01)

@@ -8,9 +8,9 @@ from tubepose.config import Config
 from tubepose.errors import ConfigError
 from tubepose.labware import SlotShape, load_rack
 from tubepose.rack import RackStatus
-from tubepose.rack_grid import register_grid
-from tubepose.rack_lattice import SlotLattice
-from tubepose.rack_naming import catalogue_racks, name_rack
+from tubepose.rack.grid import register_grid
+from tubepose.rack.lattice import SlotLattice
+from tubepose.rack.naming import catalogue_racks, name_rack
 from tubepose.transforms import HALF_TURN, transform_points
 from tubepose_cli.racks import read_rack
 

@@ -5,10 +5,10 @@ import pytest
 import scenes
 from scipy.spatial.transform import Rotation
 
-import tubepose.rack_obb as rack_obb
 from tubepose.config import Config, RackConfig
 from tubepose.labware import load_rack
-from tubepose.rack import RackStatus, rack_template_m, register_rack
+from tubepose.rack import RackStatus, obb, register_rack
+from tubepose.rack.obb import rack_template_m
 from tubepose.transforms import HALF_TURN, make_transform, transform_points
 
 SOFT = load_rack("chen2023-soft-5x10")
@@ -99,7 +99,7 @@ def test_the_template_lies_on_the_solid_top_and_nowhere_else():
 
 
 def test_a_bounding_box_that_stands_askew_does_not_lose_the_rack(soft_scan, monkeypatch):
-    hypotheses = rack_obb._hypotheses
+    hypotheses = obb._hypotheses
     askew = make_transform(Rotation.from_euler("x", 25, degrees=True).as_matrix(), np.zeros(3))
     starts = []
 
@@ -107,7 +107,7 @@ def test_a_bounding_box_that_stands_askew_does_not_lose_the_rack(soft_scan, monk
         starts.extend(T @ askew for T in hypotheses(*arguments))
         return starts
 
-    monkeypatch.setattr(rack_obb, "_hypotheses", turned)
+    monkeypatch.setattr(obb, "_hypotheses", turned)
     pose = register_rack(soft_scan, SOFT, CONFIG)
     assert len(starts) > 0
     assert pose.status is RackStatus.OK

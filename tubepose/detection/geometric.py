@@ -14,10 +14,10 @@ from tubepose.config import Config
 from tubepose.detection.model import RACK_CLASS, TUBE_CLASS, Detection
 from tubepose.labware import RackModel, TubeModel
 from tubepose.preprocessing import TALLEST_TUBE_M, find_rack_top
-from tubepose.rack_edges import best_registration, coarse_sample
-from tubepose.rack_fit import top_frame
-from tubepose.rack_pose import MIN_POINTS
-from tubepose.rack_search import levels
+from tubepose.rack.edges import best_registration, coarse_sample
+from tubepose.rack.fit import top_frame
+from tubepose.rack.pose import MIN_POINTS
+from tubepose.rack.search import levels
 from tubepose.transforms import FloatArray, invert_transform, transform_points
 
 CELL_M = 5e-4

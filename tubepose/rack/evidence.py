@@ -6,10 +6,10 @@ from functools import lru_cache
 
 import numpy as np
 
-from tubepose import rack_view_kernels as view_kernels
 from tubepose.labware import RackModel
-from tubepose.rack_field import top_field
-from tubepose.rack_fit import EDGE_SHIFT_M, WRONG_SHARE, Labels, RoughFit, at_the_top
+from tubepose.rack import view_kernels as view_kernels
+from tubepose.rack.field import top_field
+from tubepose.rack.fit import EDGE_SHIFT_M, WRONG_SHARE, Labels, RoughFit, at_the_top
 from tubepose.transforms import FloatArray
 
 # Blur of an edge in what counts as evidence: it must forgive a pixel.

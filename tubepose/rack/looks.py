@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from tubepose import rack_view_kernels as view_kernels
 from tubepose.labware import RackModel
-from tubepose.rack_evidence import likelier_step_m
-from tubepose.rack_fit import HOPELESS_SHARE, RoughFit, camera_place, rack_frame, roughly, top_frame
-from tubepose.rack_pose import MIN_POINTS
+from tubepose.rack import view_kernels as view_kernels
+from tubepose.rack.evidence import likelier_step_m
+from tubepose.rack.fit import HOPELESS_SHARE, RoughFit, camera_place, rack_frame, roughly, top_frame
+from tubepose.rack.pose import MIN_POINTS
 from tubepose.transforms import FloatArray, make_transform
 
 # A rack full of caps shows its lattice better than its ends: so many slots may the search be off.

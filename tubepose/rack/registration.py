@@ -1,4 +1,4 @@
-"""Pose of the rack (paper, section IV-A): by the edges of its ribs, or by the paper's OBB and ICP.
+"""A registration of the rack by one of the two methods, and what to say when it fails.
 
 Either way a registration that contradicts the rack's definition is refused, and what a capture cannot show is told
 apart from a wrong rack.
@@ -14,10 +14,10 @@ from tubepose.capture.session import SlotHint
 from tubepose.config import Config
 from tubepose.labware import RackModel
 from tubepose.preprocessing import level_noise_m, plausible_unit_factors, thin
-from tubepose.rack_acceptance import outline_words, too_noisy
-from tubepose.rack_edges import register_edges
-from tubepose.rack_obb import rack_template_m, register_obb_icp
-from tubepose.rack_pose import MIN_POINTS, RackPose, RackStatus
+from tubepose.rack.acceptance import outline_words, too_noisy
+from tubepose.rack.edges import register_edges
+from tubepose.rack.obb import register_obb_icp
+from tubepose.rack.pose import MIN_POINTS, RackPose, RackStatus
 from tubepose.transforms import FloatArray
 
 _Method = Callable[
@@ -81,6 +81,3 @@ def _unit_suspicion(points_m: FloatArray, rack: RackModel, config: Config, metho
                 "is the unit of the capture declared right (m or mm)?"
             )
     return ""
-
-
-__all__ = ["MIN_POINTS", "RackPose", "RackStatus", "rack_template_m", "register_rack"]

@@ -9,9 +9,9 @@ from tubepose.capture.frame import CameraIntrinsics
 from tubepose.capture.session import SlotHint
 from tubepose.config import Config
 from tubepose.labware import RackModel, catalogue
-from tubepose.rack_edges import Registration, best_registration, coarse_sample, pose_of
-from tubepose.rack_pose import MIN_POINTS, RackPose, RackStatus
-from tubepose.rack_search import levels
+from tubepose.rack.edges import Registration, best_registration, coarse_sample, pose_of
+from tubepose.rack.pose import MIN_POINTS, RackPose, RackStatus
+from tubepose.rack.search import levels
 from tubepose.transforms import FloatArray
 
 # Racks in a reason: the first ones tell enough.

@@ -26,8 +26,8 @@ from tubepose.preprocessing import (
     to_o3d,
     voxel_downsample,
 )
-from tubepose.rack_acceptance import agreement, outline_words, refusal, too_coarse
-from tubepose.rack_pose import MIN_POINTS, RackPose, RackStatus, choose_turn, unused_hint
+from tubepose.rack.acceptance import agreement, outline_words, refusal, too_coarse
+from tubepose.rack.pose import MIN_POINTS, RackPose, RackStatus, choose_turn, unused_hint
 from tubepose.transforms import HALF_TURN, FloatArray, invert_transform, make_transform, transform_points
 
 

@@ -1,4 +1,4 @@
-"""The loops over points of a rack's search and of what speaks for a pose, compiled; see `rack_kernels`."""
+"""The loops over points of a rack's search and of what speaks for a pose, compiled; see `kernels`."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import math
 import numpy as np
 
 from tubepose.compiled import compiled
-from tubepose.rack_kernels import in_frame
+from tubepose.rack.kernels import in_frame
 
 
 @compiled

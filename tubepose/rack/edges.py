@@ -13,13 +13,13 @@ from tubepose.capture.session import SlotHint
 from tubepose.config import Config, RackConfig, RackTopConfig
 from tubepose.labware import RackModel
 from tubepose.preprocessing import point_spacing_m, thin
-from tubepose.rack_acceptance import outline_words, too_coarse
-from tubepose.rack_agreement import Agreement, contradiction, measure_agreement, outline_fits, rough_evidence
-from tubepose.rack_field import top_field
-from tubepose.rack_fit import Fit, RoughFit, filled, rack_frame, refine
-from tubepose.rack_looks import SLOT_STEPS, look_at, on_lattice, seen_near
-from tubepose.rack_pose import MIN_POINTS, RackPose, RackStatus, choose_turn, unused_hint
-from tubepose.rack_search import Band, levels, search
+from tubepose.rack.acceptance import outline_words, too_coarse
+from tubepose.rack.agreement import Agreement, contradiction, measure_agreement, outline_fits, rough_evidence
+from tubepose.rack.field import top_field
+from tubepose.rack.fit import Fit, RoughFit, filled, rack_frame, refine
+from tubepose.rack.looks import SLOT_STEPS, look_at, on_lattice, seen_near
+from tubepose.rack.pose import MIN_POINTS, RackPose, RackStatus, choose_turn, unused_hint
+from tubepose.rack.search import Band, levels, search
 from tubepose.transforms import HALF_TURN, FloatArray, make_transform
 
 # Places whose coarse picture agrees less than this, compared with one that was accepted, are no rivals of it.

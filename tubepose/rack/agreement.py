@@ -14,13 +14,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from tubepose import rack_kernels as kernels
-from tubepose import rack_view_kernels as view_kernels
 from tubepose.config import RackConfig
 from tubepose.labware import RackModel
-from tubepose.rack_evidence import evidence_of
-from tubepose.rack_field import GRID_M, PICTURE_M, picture, top_field
-from tubepose.rack_fit import LEAST_POINTS, Fit, RoughFit, camera_place, label, rack_frame, top_frame
+from tubepose.rack import kernels as kernels
+from tubepose.rack import view_kernels as view_kernels
+from tubepose.rack.evidence import evidence_of
+from tubepose.rack.field import GRID_M, PICTURE_M, picture, top_field
+from tubepose.rack.fit import LEAST_POINTS, Fit, RoughFit, camera_place, label, rack_frame, top_frame
 from tubepose.transforms import FloatArray
 
 # Half thickness of the layer that is judged: the standard deviation of heights, but at least that of a good sensor, and

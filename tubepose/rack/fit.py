@@ -15,10 +15,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from tubepose import rack_kernels as kernels
-from tubepose import rack_view_kernels as view_kernels
 from tubepose.labware import RackModel
-from tubepose.rack_field import TopField, top_field
+from tubepose.rack import kernels as kernels
+from tubepose.rack import view_kernels as view_kernels
+from tubepose.rack.field import TopField, top_field
 from tubepose.transforms import FloatArray, make_transform
 
 # Per round: blur of the edges (the first as wide as a coarse start may be off, the last half a pixel of 0.4 mm), and

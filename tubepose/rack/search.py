@@ -12,10 +12,10 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import fft
 
-from tubepose import rack_view_kernels as view_kernels
 from tubepose.config import RackTopConfig
 from tubepose.labware import RackModel
-from tubepose.rack_field import PICTURE_M, TURNS, picture, picture_spectrum, solid_signature, top_field, turn_signature
+from tubepose.rack import view_kernels as view_kernels
+from tubepose.rack.field import PICTURE_M, TURNS, picture, picture_spectrum, solid_signature, top_field, turn_signature
 from tubepose.transforms import FloatArray, make_transform
 
 # Points that planes are drawn from and judged by, and how many planes are drawn: a top of a tenth of the points is

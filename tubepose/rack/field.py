@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import fft
 
-from tubepose import rack_kernels as kernels
 from tubepose.labware import RackModel
+from tubepose.rack import kernels as kernels
 from tubepose.transforms import FloatArray
 
 Float32 = NDArray[np.float32]
