@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import sys
 from pathlib import Path
 from typing import Annotated
@@ -61,7 +62,7 @@ def estimate(
 
     Writes racks.csv, slots.csv, estimates.csv, timings.csv, run.json and overlays/ into --out.
     """
-    from tubepose.batch import Job
+    from tubepose.batch import Job, UnnamedJob
     from tubepose.capture.session import SESSION_FILE, is_session
     from tubepose.config import load_config
     from tubepose.errors import CaptureError, TubePoseError
@@ -84,13 +85,13 @@ def estimate(
     methods = read_methods(method)
     detector_for = make_detector(detector, model, boxes, classes, layout, settings)
     topics = {"cloud": cloud_topic, "depth": depth_topic, "image": image_topic, "info": info_topic}
-    jobs: list[Job] = []
+    jobs: list[Job | UnnamedJob] = []
     problems: list[str] = []
     captures = [found for path in captures for found in (sessions_below(path) or [path])]
     for path in captures:
         try:
             found, unread = capture_jobs(
-                path, choice, tube_models, settings, unit=unit, hint=hint, topics=topics, fail_fast=fail_fast, say=say
+                path, choice, tube_models, settings, unit=unit, hint=hint, topics=topics, fail_fast=fail_fast
             )
             kept, twins = refuse_twins(found, jobs)
             if twins and fail_fast:
@@ -110,10 +111,14 @@ def estimate(
         problems=problems, detector=detector,
     )  # fmt: skip
     for row in tables.racks:
+        if not row["rack"]:
+            continue  # its reason is among the problems
         settle = row["hint_note"] or "--hint SLOT@U,V settles it"
         turn = f", turn ambiguous by 180 degrees (slot names may be swapped; {settle})" if row["ambiguous"] else ""
         if row["status"] == "ok":
-            rack_words = f"ok, inlier rmse {row['inlier_rmse_m'] * 1e3:.2f} mm{turn}"
+            margin = row["named_by_margin"]
+            named = f" (named by a margin of {margin:.0%})" if not math.isnan(margin) else ""
+            rack_words = f"ok{named}, inlier rmse {row['inlier_rmse_m'] * 1e3:.2f} mm{turn}"
         else:
             others = (
                 "; --rack auto tells which of the catalogue's it is"

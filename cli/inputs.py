@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import difflib
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from tubepose.batch import DetectorFactory, Job
+    from tubepose.batch import DetectorFactory, Job, UnnamedJob
     from tubepose.capture.session import SlotHint
     from tubepose.config import Config
     from tubepose.labware import RackModel, TubeModel
@@ -100,18 +100,16 @@ def capture_jobs(
     hint: str | None = None,
     topics: Mapping[str, str | None] | None = None,
     fail_fast: bool = False,
-    say: Callable[[str], None] = lambda _: None,
-) -> tuple[list[Job], list[str]]:
+) -> tuple[list[Job | UnnamedJob], list[str]]:
     """Jobs of one typed path (a session's trials, or the captures found there), and what could not be opened.
 
-    `choice` and `tubes` win over what a session says. What is found out about racks is told to `say`.
+    `choice` and `tubes` win over what a session says.
     """
-    from tubepose.batch import Job, session_jobs
+    from tubepose.batch import Job, UnnamedJob, session_jobs
     from tubepose.capture.session import SESSION_FILE, is_session, load_session
     from tubepose.capture.source import open_captures
     from tubepose.errors import CaptureError, ConfigError
-    from tubepose.labware import load_rack
-    from tubepose_cli.racks import UNKNOWN, find_racks
+    from tubepose_cli.racks import rack_finder
 
     if path.name == SESSION_FILE or (path.is_dir() and is_session(path)):
         given = {"--unit": unit, "--hint": hint} | {f"--{kind}-topic": name for kind, name in (topics or {}).items()}
@@ -122,27 +120,29 @@ def capture_jobs(
                 "leave it out, or give the captures one by one"
             )
         known, problems = session_jobs(load_session(path), fail_fast=fail_fast)
-        jobs = [replace(job, rack=choice.rack or job.rack, tubes=tubes or job.tubes) for job in known]
-        found, unfound = find_racks(jobs, choice, config, fail_fast=fail_fast, say=say) if choice.open else (jobs, [])
-        return found, [*problems, *unfound]
+        if choice.open:
+            find = rack_finder(choice, config)
+            return [
+                UnnamedJob(job.capture, find, tubes or job.tubes, job.hint, job.session, job.trial) for job in known
+            ], problems
+        return [replace(job, rack=choice.rack or job.rack, tubes=tubes or job.tubes) for job in known], problems
     if not path.exists():
         raise CaptureError(f"{path}: no such file or folder")
     topic = {f"{kind}_topic": name for kind, name in (topics or {}).items()}
+    told = read_hint(hint, choice.rack) if hint is not None else None
     if choice.rack is not None:
-        told = read_hint(hint, choice.rack) if hint is not None else None
         return [Job(capture, choice.rack, tubes, told) for capture in open_captures(path, unit=unit, **topic)], []
     if not choice.open:
         raise ConfigError(
             f"{path}: not a session, so the rack must be named: --rack NAME|FILE|auto|grid "
             "(see 'tubepose labware list')"
         )
-    jobs = [Job(capture, load_rack(UNKNOWN), tubes) for capture in open_captures(path, unit=unit, **topic)]
-    found, problems = find_racks(jobs, choice, config, fail_fast=fail_fast, say=say)
-    return [replace(job, hint=read_hint(hint, job.rack)) for job in found] if hint else found, problems
+    find = rack_finder(choice, config)
+    return [UnnamedJob(capture, find, tubes, told) for capture in open_captures(path, unit=unit, **topic)], []
 
 
-def read_hint(text: str, rack: RackModel) -> SlotHint:
-    """The hint SLOT@U,V."""
+def read_hint(text: str, rack: RackModel | None) -> SlotHint:
+    """The hint SLOT@U,V; whether a rack that is still to be named has the slot, the batch tells."""
     from tubepose.capture.session import SlotHint
     from tubepose.errors import ConfigError
 
@@ -151,7 +151,7 @@ def read_hint(text: str, rack: RackModel) -> SlotHint:
         u, v = (float(value) for value in pixel.split(","))
     except ValueError:
         raise ConfigError(f"--hint {text}: expected SLOT@U,V, for example A1@412,300") from None
-    if slot not in {known.name for known in rack.all_slots}:
+    if rack is not None and slot not in {known.name for known in rack.all_slots}:
         raise ConfigError(f"--hint {text}: no slot {slot} in rack {rack.name}; {_slot_range(rack)}")
     return SlotHint(slot=slot, pixel=(u, v))
 
@@ -160,7 +160,9 @@ def _slot_range(rack: RackModel) -> str:
     return f"its slots run from {rack.all_slots[0].name} to {rack.all_slots[-1].name}"
 
 
-def refuse_twins(found: Sequence[Job], others: Sequence[Job]) -> tuple[list[Job], list[str]]:
+def refuse_twins(
+    found: Sequence[Job | UnnamedJob], others: Sequence[Job | UnnamedJob]
+) -> tuple[list[Job | UnnamedJob], list[str]]:
     """The jobs that differ from all before them by name, and one line per capture that does not.
 
     Rows are told apart by session, trial and capture, and pictures are named by them.

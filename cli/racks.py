@@ -2,19 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from tubepose.batch import Job
-    from tubepose.capture.source import Capture
+    from tubepose.batch import RackFinder
+    from tubepose.capture.frame import RgbdFrame
     from tubepose.config import Config
     from tubepose.labware import RackModel
+    from tubepose.rack import RackPose
     from tubepose.rack.lattice import SlotLattice
-
-# Stands in a job until its rack is found.
-UNKNOWN = "chen2023-soft-5x10"
 
 
 @dataclass(frozen=True)
@@ -83,47 +80,16 @@ def _sides(option: str, text: str) -> tuple[float, float]:
     return sides[0], sides[-1]
 
 
-def find_rack(capture: Capture, choice: RackChoice, config: Config) -> tuple[RackModel, float]:
-    """The rack of a capture whose rack is not named, from its first frame; and the margin by which it was named.
-
-    Raises:
-        CaptureError: No rack can be named, or no slots are found; the reason holds the ranking.
-    """
-    from tubepose.errors import CaptureError
-    from tubepose.provenance import pinned_threads
+def rack_finder(choice: RackChoice, config: Config) -> RackFinder:
+    """What finds the rack of a frame where ``--rack`` is ``auto`` or ``grid``."""
     from tubepose.rack.grid import register_grid
     from tubepose.rack.naming import name_rack
 
-    frame = next(iter(capture.frames()), None)
-    if frame is None:
-        raise CaptureError(f"{capture.path}: no frame to find the rack in")
-    points_m = frame.points_m[frame.valid]
-    with pinned_threads(1):
+    def find(frame: RgbdFrame) -> RackPose:
+        points_m = frame.points_m[frame.valid]
         if choice.lattice is not None:
-            pose = register_grid(points_m, choice.lattice, config, frame.intrinsics)
-        else:
-            pose, _ = name_rack(points_m, config, intrinsics=frame.intrinsics)
-    if pose.rack is None or pose.T_camera_rack is None:
-        raise CaptureError(f"{capture.path}: {pose.reason}")
-    return pose.rack, pose.named_by_margin
+            return register_grid(points_m, choice.lattice, config, frame.intrinsics)
+        pose, _ = name_rack(points_m, config, intrinsics=frame.intrinsics)
+        return pose
 
-
-def find_racks(
-    jobs: Iterable[Job], choice: RackChoice, config: Config, *, fail_fast: bool, say: Callable[[str], None]
-) -> tuple[list[Job], list[str]]:
-    """The jobs with the racks that are found in their captures, and one line per capture that has none."""
-    from tubepose.errors import TubePoseError
-
-    found, problems = [], []
-    for job in jobs:
-        try:
-            rack, margin = find_rack(job.capture, choice, config)
-        except TubePoseError as problem:
-            if fail_fast:
-                raise
-            problems.append(str(problem))
-            continue
-        by = f", by a margin of {margin:.0%}" if choice.auto else ""
-        say(f"{job.capture.name}: rack {rack.name} found{by}")
-        found.append(replace(job, rack=rack, named_by_margin=margin))
-    return found, problems
+    return find

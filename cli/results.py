@@ -7,14 +7,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from tubepose.batch import DetectorFactory, Job, Tables
+    from tubepose.batch import DetectorFactory, Job, Tables, UnnamedJob
     from tubepose.config import Config
-    from tubepose.labware import Labware
     from tubepose.pipeline import Scene, TubeEstimate
 
 
 def run_estimates(
-    jobs: Sequence[Job],
+    jobs: Sequence[Job | UnnamedJob],
     methods: Sequence[str],
     detector_for: DetectorFactory,
     config: Config,
@@ -53,14 +52,10 @@ def run_estimates(
     write_csv(out / "slots.csv", to_table(tables.slots, SLOT_COLUMNS))
     write_csv(out / "estimates.csv", to_table(tables.estimates, ESTIMATE_COLUMNS))
     write_csv(out / "timings.csv", to_table(tables.timings, TIMING_COLUMNS))
-    labware: dict[str, Labware] = {}
-    for job in jobs:
-        labware[job.rack.name] = job.rack
-        labware.update({tube.name: tube for tube in job.tubes})
     record = run_record(
         command,
         config,
-        list(labware.values()),
+        list(tables.labware.values()),
         [*inputs, *dict.fromkeys(job.capture.path for job in jobs if job.capture.path.exists())],
         methods=list(methods),
         seeds=list(range(seeds)),

@@ -50,7 +50,7 @@ ALLOWED: dict[str, set[str]] = {
         "stage_times",
     },
     "stage_times": set(),
-    "records": {"pipeline", "pose_errors", "slots"},
+    "records": {"capture", "pipeline", "pose_errors", "rack", "slots"},
     "batch": {"capture", "config", "labware", "detection", "rack", "pipeline", "records"},
     "ground_truth": {"capture", "labware"},
     "simulation": {"capture", "labware"},

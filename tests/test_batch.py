@@ -9,13 +9,14 @@ import numpy as np
 import pytest
 import scenes
 
-from tubepose.batch import Job, Tables, run_jobs, session_jobs, trial_capture
+from tubepose.batch import Job, Tables, UnnamedJob, run_jobs, session_jobs, trial_capture
 from tubepose.capture.frame import RgbdFrame
-from tubepose.capture.session import Session, load_session
+from tubepose.capture.session import Session, SlotHint, load_session
 from tubepose.config import Config
 from tubepose.detection.geometric import GeometricDetector
 from tubepose.errors import CaptureError, DetectorError
 from tubepose.labware import load_rack, load_tube
+from tubepose.rack import RackPose, RackStatus
 from tubepose.records import ESTIMATE_COLUMNS, RACK_COLUMNS, SLOT_COLUMNS, TIMING_COLUMNS, to_table
 from tubepose.transforms import transform_points
 
@@ -54,7 +55,7 @@ def job(name: str, *frames: RgbdFrame, problem: Exception | None = None, **more:
     return Job(Recorded(name, frames, problem), RACK, (TUBE,), **more)
 
 
-def run(*jobs: Job, methods: tuple[str, ...] = ("upright",), **options: Any) -> Tables:
+def run(*jobs: Job | UnnamedJob, methods: tuple[str, ...] = ("upright",), **options: Any) -> Tables:
     return run_jobs(jobs, methods, lambda rack, tubes: GeometricDetector(rack, tubes, CONFIG), CONFIG, **options)
 
 
@@ -197,3 +198,51 @@ def test_a_trial_names_one_capture(session: Session) -> None:
     assert trial_capture(session, session.trials[1], "scan-2").name == "scan-2"
     with pytest.raises(CaptureError, match="trial two needs one capture, found 2"):
         trial_capture(session, session.trials[1], "folder")
+
+
+# A rack that no one named -------------------------------------------------------------------------------------------
+
+
+def unnamed(name: str, *frames: RgbdFrame, nameable: tuple[int, ...] = (), **more: Any) -> UnnamedJob:
+    """A job whose finder names `RACK` in the frames of these numbers only."""
+
+    def find(frame: RgbdFrame) -> RackPose:
+        if frame.index in nameable:
+            return RackPose(RackStatus.OK, "", T_CAMERA_RACK, rack=RACK, named_by_margin=0.75)
+        return RackPose(RackStatus.REFUSED, f"no rack fits in {frame.index}")
+
+    return UnnamedJob(Recorded(name, frames), find, (TUBE,), **more)
+
+
+def test_a_rack_is_asked_for_until_it_is_named_and_frames_before_have_their_rows() -> None:
+    frames = [replace(GOOD, index=index) for index in range(3)]
+    tables = run(unnamed("good", *frames, nameable=(1,), session="s", trial="t"), methods=("upright", "slot-icp"))
+    assert tables.problems == []
+    rows = [(row["frame"], row["method"], row["rack"], row["status"], row["reason"]) for row in tables.racks]
+    assert rows == [
+        *((0, method, "", "refused", "no rack fits in 0") for method in ("upright", "slot-icp")),
+        *((frame, method, RACK.name, "ok", "") for frame in (1, 2) for method in ("upright", "slot-icp")),
+    ]
+    assert {(row["session"], row["trial"]) for row in tables.racks} == {("s", "t")}
+    assert {row.get("named_by_margin") for row in tables.racks} == {None, 0.75}
+    assert set(tables.labware) == {RACK.name, TUBE.name}
+    assert list(to_table(tables.racks, RACK_COLUMNS)["tx_m"].isna()) == [True, True, False, False, False, False]
+
+
+def test_a_capture_whose_rack_no_frame_names_is_a_problem_and_counted() -> None:
+    frames = [replace(GOOD, index=index) for index in range(2)]
+    tables = run(unnamed("bad", *frames), unnamed("none"), job("good", GOOD))
+    assert tables.problems == [
+        "captures/scan: no rack fits in 0",
+        "captures/scan: no frame to find the rack in",
+    ]
+    assert [(row["capture"], row["rack"]) for row in tables.racks] == [("good", ""), ("good", ""), ("good", RACK.name)]
+    with pytest.raises(CaptureError, match="no rack fits in 0"):
+        run(unnamed("bad", *frames), fail_fast=True)
+
+
+def test_a_hint_of_another_rack_is_told_in_one_line() -> None:
+    hint = SlotHint(slot="F9", pixel=(10.0, 10.0))
+    tables = run(unnamed("good", GOOD, nameable=(0,), hint=hint), job("good", GOOD, hint=hint))
+    line = f"captures/scan: the hint speaks of slot F9, and rack {RACK.name} has none of that name; its slots run"
+    assert [problem.startswith(line) for problem in tables.problems] == [True, True]

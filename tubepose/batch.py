@@ -15,13 +15,15 @@ from tubepose.capture.source import Capture, open_captures
 from tubepose.config import Config
 from tubepose.detection import Detector
 from tubepose.errors import CaptureError, TubePoseError
-from tubepose.labware import RackModel, TubeModel
+from tubepose.labware import Labware, RackModel, TubeModel
 from tubepose.pipeline import DEFAULT_METHOD, STOCHASTIC, Scene, StageTime, TubeEstimate, estimate_tubes, prepare_scene
-from tubepose.rack import RackStatus
-from tubepose.records import Row, estimate_row, rack_row, slot_rows, timing_row
+from tubepose.rack import RackPose, RackStatus
+from tubepose.records import Row, estimate_row, rack_pose_row, rack_row, slot_rows, timing_row
 from tubepose.transforms import FloatArray
 
 DetectorFactory = Callable[[RackModel, tuple[TubeModel, ...]], Detector]
+RackFinder = Callable[[RgbdFrame], RackPose]
+"""Finds out which rack stands in a frame: `RackPose.rack`, or the reason why none can be named."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -49,6 +51,27 @@ class Job:
     named_by_margin: float = float("nan")
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class UnnamedJob:
+    """One capture in which a rack stands that no one named.
+
+    Attributes:
+        capture: Where its frames come from.
+        find_rack: Asked frame by frame until it names a rack, which then is the whole capture's.
+        tubes: The kinds of tube that can stand in it.
+        hint: Which way round the rack stands, if known.
+        session: Name of its session, or empty.
+        trial: Name of its trial, or empty.
+    """
+
+    capture: Capture
+    find_rack: RackFinder
+    tubes: tuple[TubeModel, ...]
+    hint: SlotHint | None = None
+    session: str = ""
+    trial: str = ""
+
+
 @dataclass(slots=True)
 class Tables:
     """Rows of the result files, in the order in which they came.
@@ -58,6 +81,7 @@ class Tables:
         slots: One per frame, method and slot.
         estimates: One per frame, method, seed and detected tube.
         timings: One per timed stage instance.
+        labware: Every rack and tube that was looked for, by name.
         problems: One line per capture that could not be finished.
     """
 
@@ -65,6 +89,7 @@ class Tables:
     slots: list[Row] = field(default_factory=list)
     estimates: list[Row] = field(default_factory=list)
     timings: list[Row] = field(default_factory=list)
+    labware: dict[str, Labware] = field(default_factory=dict)
     problems: list[str] = field(default_factory=list)
 
 
@@ -100,7 +125,7 @@ def trial_capture(session: Session, trial: Trial, relative: str) -> Capture:
 
 
 def run_jobs(
-    jobs: Sequence[Job],
+    jobs: Sequence[Job | UnnamedJob],
     methods: Sequence[str],
     detector_for: DetectorFactory,
     config: Config,
@@ -127,12 +152,12 @@ def run_jobs(
     tables = Tables()
     for job in jobs:
         try:
-            for frame, load_ms in _timed_frames(job.capture):
+            for named, frame, load_ms in _named_frames(job, methods, tables):
                 if warm_up:
                     warm_up = False
-                    _run_frame(job, frame, methods, detector_for, config, seeds, Tables(), tables.timings)
+                    _run_frame(named, frame, methods, detector_for, config, seeds, Tables(), tables.timings)
                 load = StageTime("load", "all", "", None, load_ms)
-                _run_frame(job, frame, methods, detector_for, config, seeds, tables, None, load, on_scene)
+                _run_frame(named, frame, methods, detector_for, config, seeds, tables, None, load, on_scene)
         except TubePoseError as problem:
             if fail_fast:
                 raise
@@ -142,9 +167,47 @@ def run_jobs(
     return tables
 
 
-def _one_line(job: Job, problem: TubePoseError) -> str:
+def _one_line(job: Job | UnnamedJob, problem: TubePoseError) -> str:
     text = str(problem)
     return text if str(job.capture.path) in text else f"{job.capture.name}: {text}"
+
+
+def _named_frames(
+    job: Job | UnnamedJob, methods: Sequence[str], tables: Tables
+) -> Iterator[tuple[Job, RgbdFrame, float]]:
+    """Frames whose rack is known, with the milliseconds of loading; the others have their rows in `tables.racks`.
+
+    Raises:
+        CaptureError: No frame's rack can be named, or the hint's slot is none of the rack's.
+    """
+    named, reason = job if isinstance(job, Job) else None, ""
+    for frame, load_ms in _timed_frames(job.capture):
+        if isinstance(job, UnnamedJob) and named is None:
+            pose = job.find_rack(frame)
+            if pose.rack is None or pose.T_camera_rack is None:
+                reason = reason or pose.reason
+                row = {**_keys(job, frame), "rack": "", **rack_pose_row(frame, pose)}
+                tables.racks += [{**row, "method": method} for method in methods]
+                continue
+            named = Job(job.capture, pose.rack, job.tubes, job.hint, job.session, job.trial, None, pose.named_by_margin)
+        assert named is not None
+        _check_hint(named)
+        yield named, frame, load_ms
+    if named is None:
+        raise CaptureError(f"{job.capture.path}: {reason or 'no frame to find the rack in'}")
+
+
+def _check_hint(job: Job) -> None:
+    names = [slot.name for slot in job.rack.all_slots]
+    if job.hint is not None and job.hint.slot not in names:
+        raise CaptureError(
+            f"{job.capture.path}: the hint speaks of slot {job.hint.slot}, and rack {job.rack.name} has none of that "
+            f"name; its slots run from {names[0]} to {names[-1]}"
+        )
+
+
+def _keys(job: Job | UnnamedJob, frame: RgbdFrame) -> Row:
+    return {"session": job.session, "trial": job.trial, "capture": frame.capture, "frame": frame.index}
 
 
 def _timed_frames(capture: Capture) -> Iterator[tuple[RgbdFrame, float]]:
@@ -171,7 +234,9 @@ def _run_frame(
 ) -> None:
     detector = detector_for(job.rack, job.tubes)
     scene = prepare_scene(frame, job.rack, job.tubes, detector, config, job.hint, job.T_camera_rack, methods)
-    keys = {"session": job.session, "trial": job.trial, "capture": frame.capture, "frame": frame.index}
+    tables.labware[job.rack.name] = job.rack
+    tables.labware |= {tube.name: tube for tube in job.tubes}
+    keys = _keys(job, frame)
     times = ([load] if load is not None else []) + list(scene.times)
     shown_method = DEFAULT_METHOD if DEFAULT_METHOD in methods else methods[0]
     shown: tuple[TubeEstimate, ...] = ()

@@ -8,8 +8,10 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from tubepose.capture.frame import RgbdFrame
 from tubepose.pipeline import Scene, StageTime, TubeEstimate, best_rack
 from tubepose.pose_errors import COVARIANCE_COLUMNS, upper_half
+from tubepose.rack import RackPose
 from tubepose.slots import covered_slots
 from tubepose.transforms import FloatArray, quaternion_wxyz, tilt_rad
 
@@ -73,10 +75,21 @@ def pose_columns(T: FloatArray | None) -> Row:
 
 def rack_row(scene: Scene) -> Row:
     """Row of racks.csv, without its keys."""
-    pose, box = scene.rack_pose, best_rack(scene.detections)
+    box = best_rack(scene.detections)
     return {
-        "timestamp_ns": scene.frame.timestamp_ns,
         "rack": scene.rack.name,
+        "n_tubes_detected": sum(not detection.is_rack for detection in scene.detections),
+        "box_source": box.source if box is not None else None,
+        "box_score": box.score if box is not None else float("nan"),
+        "box_note": box.note if box is not None else "",
+        **rack_pose_row(scene.frame, scene.rack_pose),
+    }
+
+
+def rack_pose_row(frame: RgbdFrame, pose: RackPose) -> Row:
+    """What a row of racks.csv says of the pose: all that there is to say where no rack can be named."""
+    return {
+        "timestamp_ns": frame.timestamp_ns,
         "status": pose.status.value,
         "reason": pose.reason,
         "ambiguous": pose.ambiguous,
@@ -88,10 +101,6 @@ def rack_row(scene: Scene) -> Row:
         "in_slot_share": pose.in_slot_share,
         "coverage": pose.coverage,
         "spacing_m": pose.spacing_m,
-        "n_tubes_detected": sum(not detection.is_rack for detection in scene.detections),
-        "box_source": box.source if box is not None else None,
-        "box_score": box.score if box is not None else float("nan"),
-        "box_note": box.note if box is not None else "",
         **pose_columns(pose.T_camera_rack),
         **covariance_columns(pose.covariance, RACK_COVARIANCE_COLUMNS),
     }
