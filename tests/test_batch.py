@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 import pytest
 import scenes
 
@@ -246,3 +247,9 @@ def test_a_hint_of_another_rack_is_told_in_one_line() -> None:
     tables = run(unnamed("good", GOOD, nameable=(0,), hint=hint), job("good", GOOD, hint=hint))
     line = f"captures/scan: the hint speaks of slot F9, and rack {RACK.name} has none of that name; its slots run"
     assert [problem.startswith(line) for problem in tables.problems] == [True, True]
+
+
+def test_a_stamp_is_exact_beside_a_capture_without_one() -> None:
+    stamp = 1_861_606_485_123_456_789
+    tables = run(job("good", replace(GOOD, timestamp_ns=stamp)), job("good", replace(GOOD, timestamp_ns=None)))
+    assert to_table(tables.racks, RACK_COLUMNS)["timestamp_ns"].tolist() == [stamp, pd.NA]

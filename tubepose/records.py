@@ -63,7 +63,9 @@ _WHOLE = ("timestamp_ns", "seed")
 def to_table(rows: Sequence[Row], columns: Sequence[str]) -> pd.DataFrame:
     """Rows as a table with exactly these columns; stamps and seeds stay whole numbers (Int64)."""
     table = pd.DataFrame(list(rows), columns=list(columns))
-    return table.astype({name: "Int64" for name in _WHOLE if name in columns})
+    for name in set(_WHOLE) & set(columns):  # not by way of floats, which hold no nanoseconds
+        table[name] = pd.array([row.get(name) for row in rows], dtype="Int64")
+    return table
 
 
 def pose_columns(T: FloatArray | None) -> Row:
