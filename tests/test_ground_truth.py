@@ -15,7 +15,7 @@ from tubepose.capture.frame import CameraIntrinsics, RgbdFrame
 from tubepose.capture.session import SlotHint
 from tubepose.ground_truth import GroundTruthConfig, GroundTruthResult, measure_ground_truth
 from tubepose.labware import CapModel, RackModel, TubeModel
-from tubepose.transforms import axis_rotation, invert_transform, make_transform, tilt_rad, transform_points
+from tubepose.transforms import axis_rotation, invert_transform, make_transform, tilt_rad, transform_points, translation
 
 RACK = RackModel.model_validate(
     {
@@ -93,7 +93,7 @@ class Scene:
         distance = np.full(len(rays), np.inf)
         if self.table:
             distance = self._plane(self.T_camera_rack, origin, rays, lambda xy: np.full(len(xy), True))
-        top = self.T_camera_rack @ make_transform(np.eye(3), np.array([0, 0, RACK.height_m]))
+        top = self.T_camera_rack @ translation([0, 0, RACK.height_m])
         distance = np.fmin(distance, self._plane(top, origin, rays, lambda xy: RACK.top_signed_distance_m(xy) <= 0))
         for slot, T_rack_square in self.T_rack_square.items():
             kept = 1 - 2 * self.hide.get(slot, 0.0)
@@ -278,7 +278,7 @@ def test_wrong_slot_declared_names_where_the_cap_stands() -> None:
 
 def test_second_cap_near_a_slot_is_refused() -> None:
     scene = Scene()
-    beside = make_transform(np.eye(3), np.array([19e-3, -4e-3, 0.0]))
+    beside = translation([19e-3, -4e-3, 0.0])
     scene.T_rack_square["C5 again"] = beside @ scene.T_rack_square["C5"]
     assert "two caps on one slot" in reason_of(scene.measure(), "C5")
 
@@ -287,9 +287,9 @@ def test_caps_that_touch_in_a_coarse_scan_are_separated() -> None:
     coarse = CameraIntrinsics(width=140, height=115, fx=600.0, fy=600.0, cx=69.5, cy=57.0)
     scene = Scene(layout={"A1": TALL, "A2": TALL, "A3": TALL, "C4": SHORT}, max_tilt_deg=0.3)
     for step, slot in enumerate(("A1", "A2", "A3")):
-        T = make_transform(np.eye(3), np.array([-36e-3 + 16.75e-3 * step, 18e-3, RACK.floor_m + CAP.offset_m(TALL)]))
+        T = translation([-36e-3 + 16.75e-3 * step, 18e-3, RACK.floor_m + CAP.offset_m(TALL)])
         scene.T_rack_square[slot] = T
-        scene.T_rack_tube[slot] = T @ make_transform(np.eye(3), np.array([0.0, 0.0, -CAP.offset_m(TALL)]))
+        scene.T_rack_tube[slot] = T @ translation([0.0, 0.0, -CAP.offset_m(TALL)])
     result = scene.measure(scene.frame(coarse))
     _, shifts = errors(scene, result)
     assert len(shifts) == 4, [truth.reason for truth in result.tubes]

@@ -12,7 +12,7 @@ from tubepose.rack import RackStatus, edges, looks, register_rack
 from tubepose.rack.acceptance import too_coarse
 from tubepose.rack.field import top_field
 from tubepose.rack.fit import filled, refine
-from tubepose.transforms import HALF_TURN, invert_transform, make_transform, transform_points
+from tubepose.transforms import HALF_TURN, invert_transform, transform_points, translation
 
 CONFIG = Config()
 SOFT = load_rack("chen2023-soft-5x10")
@@ -136,7 +136,7 @@ def test_a_start_some_slots_off_is_moved_before_it_is_refined(monkeypatch, slots
     refine = edges.refine
     monkeypatch.setattr(edges, "refine", lambda *args: fits.append(1) or refine(*args))
     assert SOFT.grid is not None
-    off = make_transform(np.eye(3), np.array([*(np.multiply(slots_off, SOFT.grid.pitch_mm) * 1e-3), 0.0]))
+    off = translation([*(np.multiply(slots_off, SOFT.grid.pitch_mm) * 1e-3), 0.0])
     points = transform_points(T_TRUE, hidden_by(TOP, SOFT.all_slots[5:30], 9e-3))
     found = edges.register_at(points, T_TRUE @ off, SOFT, CONFIG.rack)
     degrees, millimetres = error(found.fit)
@@ -153,7 +153,7 @@ def test_a_place_with_much_less_evidence_than_an_accepted_one_is_not_refined(eve
     assert best.reason == ""
 
     def no_rival(shift_m, found):
-        T = T_TRUE @ make_transform(np.eye(3), np.array([shift_m, 0.0, 0.0]))
+        T = T_TRUE @ translation([shift_m, 0.0, 0.0])
         return edges._no_rival(*looks.look_at(points[::every], T, SOFT), every, found, SOFT, CONFIG.rack)
 
     half_a_rack = 5 * SOFT.grid.pitch_mm[0] * 1e-3
@@ -165,7 +165,7 @@ def test_a_place_with_much_less_evidence_than_an_accepted_one_is_not_refined(eve
 
 def test_a_rough_look_at_some_of_the_points_goes_on_with_all_of_them():
     points = transform_points(T_TRUE, TOP)
-    T = T_TRUE @ make_transform(np.eye(3), np.array([1e-3, -1e-3, 0.0]))
+    T = T_TRUE @ translation([1e-3, -1e-3, 0.0])
     few, all_of_them = (looks.look_at(points[::every], T, SOFT)[1] for every in (5, 1))
     gone_on = filled(few, points, SOFT)
     assert len(few.kept_m) < 0.3 * len(all_of_them.kept_m)

@@ -30,7 +30,7 @@ from tubepose.simulation.scene import (
 )
 from tubepose.simulation.truth import as_made, write_exact_truth
 from tubepose.simulation.variation import SceneVariation, Tolerances, load_scene_variation
-from tubepose.transforms import invert_transform, make_transform, tilt_rotation, transform_points
+from tubepose.transforms import invert_transform, make_transform, tilt_rotation, transform_points, translation
 
 RACK = load_rack("chen2023-soft-5x10")
 CAP = load_cap("printed-square-16.7")
@@ -171,7 +171,7 @@ def test_caps_as_made_collide_where_perfect_ones_do_not(wider_m, leaning_rad, to
     gap = 2 * CAPPED.max_radius_m + 0.5e-3
     fit = CapFit((0.0, leaning_rad), wider_m, 0.0)
     a = solid_of(standing(cap_fit=fit), CAP)
-    b = solid_of(standing(T=make_transform(np.eye(3), np.array([gap, 0, 0]))), CAP)
+    b = solid_of(standing(T=translation([gap, 0, 0])), CAP)
     assert collide(a, b, CAP) == touch
     assert collide(b, a, CAP) == touch
 

@@ -17,7 +17,7 @@ from tubepose.simulation.structured_light.codes import OUTSIDE
 from tubepose.simulation.structured_light.intersection import first_hits
 from tubepose.simulation.structured_light.parts import BoxPart, Piece, RevolvedPart
 from tubepose.simulation.structured_light.projector import Projector, projector_of, towards
-from tubepose.transforms import invert_transform, make_transform, transform_points
+from tubepose.transforms import invert_transform, make_transform, transform_points, translation
 
 MATTE = Material(0.5)
 CLEAR = WallOptics(refractive_index=1.49)
@@ -54,7 +54,7 @@ def slab(plastic):
     """A plate as wide as the scene, 50 mm above a dark table."""
     edge = np.array([[0.0, 0.0], [0.0, 0.12], [THICK, 0.12], [THICK, 0.0]])
     profile = np.tile([0.12, 0.0], (round(THICK / parts.PROFILE_STEP_M), 1))
-    pose = make_transform(np.eye(3), np.array([0.0, 0.0, SLAB_LOW]))
+    pose = translation([0.0, 0.0, SLAB_LOW])
     plate = RevolvedPart(pose, (Piece(parts.segments_of(edge), OUTSIDE, MATTE),), plastic, profile)
     # Polished: no gloss of the plate itself.
     return shapes.make_shapes([plate], [], Material(0.05), MATTE, None, 0.5, 1e-3)
@@ -149,7 +149,7 @@ def test_energy_is_conserved_in_a_closed_white_box(name, plastic, liquid):
     tube = None
     if name is not None:
         model = load_tube(name).model_copy(update={"cap": None})
-        pose = make_transform(np.eye(3), np.array([0.005, 0.0, -0.07]))
+        pose = translation([0.005, 0.0, -0.07])
         tube = PlacedTube("A1", model, pose, optics=plastic, liquid=liquid)
     assert absorbed_share(tube, Material(0.5)) == pytest.approx(1.0, abs=0.02)
 

@@ -15,7 +15,7 @@ import open3d as o3d
 from tubepose.config import Config, IcpConfig
 from tubepose.labware import RackModel, SlotModel, TubeModel
 from tubepose.preprocessing import to_o3d
-from tubepose.transforms import FloatArray, axis_rotation, invert_transform, make_transform
+from tubepose.transforms import FloatArray, axis_rotation, invert_transform, make_transform, translation
 from tubepose.tube import TubePose, TubeStatus
 
 registration = o3d.pipelines.registration
@@ -29,7 +29,7 @@ def fit_upright(
 ) -> TubePose:
     """The trivial answer: bottom at the slot's centre, axis along the rack's normal. It looks at no point."""
     del config, seed, tube
-    T_rack_tube = make_transform(np.eye(3), rack.bottom_center_m(slot))
+    T_rack_tube = translation(rack.bottom_center_m(slot))
     return TubePose(TubeStatus.OK, "", T_rack_tube, score=1.0, n_points=len(points_m))
 
 
@@ -38,7 +38,7 @@ def fit_slot_icp(
 ) -> TubePose:
     """ICP onto the tube's template, started upright in the slot."""
     del seed
-    start = make_transform(np.eye(3), rack.bottom_center_m(slot))
+    start = translation(rack.bottom_center_m(slot))
     if len(points_m) < 3:
         return failed("fewer than 3 points", points_m)
     return refine(points_m, start, visible_template(tube, rack.depth_m, config.icp.template_points), config.icp)

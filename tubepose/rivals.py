@@ -31,7 +31,14 @@ from tubepose.baselines import (
 from tubepose.config import Config, RivalsConfig
 from tubepose.errors import TubePoseError
 from tubepose.labware import RackModel, SlotModel, TubeModel
-from tubepose.transforms import FloatArray, axis_rotation, invert_transform, make_transform, transform_points
+from tubepose.transforms import (
+    FloatArray,
+    axis_rotation,
+    invert_transform,
+    make_transform,
+    transform_points,
+    translation,
+)
 from tubepose.tube import TubePose, TubeStatus
 
 PACKAGES = {"kiss-matcher": ("kiss_matcher", "small_gicp"), "gicp": ("small_gicp",)}
@@ -94,7 +101,7 @@ def fit_gicp(
     """small_gicp between scan and template, started upright in the slot."""
     del seed
     require_packages(["gicp"])
-    start = make_transform(np.eye(3), rack.bottom_center_m(slot))
+    start = translation(rack.bottom_center_m(slot))
     return _refine_gicp(
         points_m, start, visible_template(tube, rack.depth_m, config.icp.template_points), config.rivals
     )

@@ -6,7 +6,7 @@ Names read as chains: ``T_camera_tube = T_camera_rack @ T_rack_tube``; ``T_a_b``
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
 FloatArray = NDArray[np.float64]
@@ -20,6 +20,11 @@ def make_transform(rotation: FloatArray, translation_m: FloatArray) -> FloatArra
     T[:3, :3] = rotation
     T[:3, 3] = translation_m
     return T
+
+
+def translation(offset_m: ArrayLike) -> FloatArray:
+    """The (4, 4) transform that shifts by three numbers, metres."""
+    return make_transform(np.eye(3), np.asarray(offset_m, dtype=np.float64))
 
 
 def invert_transform(T: FloatArray) -> FloatArray:

@@ -13,7 +13,7 @@ from scipy.optimize import least_squares
 from tubepose.ground_truth.model import GroundTruthConfig
 from tubepose.ground_truth.planes import frame_about, plane_frame, plane_heights, segment_plane
 from tubepose.labware import RackModel
-from tubepose.transforms import FloatArray, invert_transform, make_transform, transform_points
+from tubepose.transforms import FloatArray, invert_transform, make_transform, transform_points, translation
 
 _FIT_POINTS = 4000
 _FIELD_STEP_M = 5e-4
@@ -68,7 +68,7 @@ def _levels(points_m: FloatArray, rack: RackModel, config: GroundTruthConfig) ->
             return
         T_camera_plane, inliers = segment_plane(rest, config.level_distance_m, 1000, config.seed)
         yield T_camera_plane
-        yield T_camera_plane @ make_transform(np.eye(3), np.array([0.0, 0.0, rack.height_m]))
+        yield T_camera_plane @ translation([0.0, 0.0, rack.height_m])
         rest = rest[~inliers]
 
 

@@ -20,7 +20,7 @@ from tubepose.rack.fit import Fit, RoughFit, filled, rack_frame, refine
 from tubepose.rack.looks import SLOT_STEPS, look_at, on_lattice, seen_near
 from tubepose.rack.pose import MIN_POINTS, RackPose, RackStatus, choose_turn, unused_hint
 from tubepose.rack.search import Band, levels, search
-from tubepose.transforms import HALF_TURN, FloatArray, make_transform
+from tubepose.transforms import HALF_TURN, FloatArray, translation
 
 # Places whose coarse picture agrees less than this, compared with one that was accepted, are no rivals of it.
 RIVAL_WORTH = 0.4
@@ -210,7 +210,7 @@ def _settled(
         stray = agreement.in_slot > 2 * config.max_stray_share or agreement.rmse_m > config.max_inlier_rmse_m
         if agreement.slot_margin >= 0 or stray:
             break
-        T_step = make_transform(np.eye(3), np.array([*agreement.step_m, 0.0]))
+        T_step = translation([*agreement.step_m, 0.0])
         near_m, rough = look_at(points_m, fit.T_camera_rack @ T_step, rack)
         farther = refine(rough, rack)
         there = measure_agreement(near_m, farther, rack, config)

@@ -19,7 +19,7 @@ from tubepose.labware import RackModel
 from tubepose.rack import kernels as kernels
 from tubepose.rack import view_kernels as view_kernels
 from tubepose.rack.field import TopField, top_field
-from tubepose.transforms import FloatArray, make_transform
+from tubepose.transforms import FloatArray, make_transform, translation
 
 # Per round: blur of the edges (the first as wide as a coarse start may be off, the last half a pixel of 0.4 mm), and
 # half widths of the heights that a plane is fitted to, one after the other.
@@ -108,7 +108,7 @@ class RoughFit:
 
 def top_frame(T_camera_rack: FloatArray, rack: RackModel) -> FloatArray:
     """T_camera_top: the rack's frame, moved up to the top; shape (4, 4), metres."""
-    return T_camera_rack @ make_transform(np.eye(3), np.array([0.0, 0.0, rack.height_m]))
+    return T_camera_rack @ translation([0.0, 0.0, rack.height_m])
 
 
 def roughly(points_m: FloatArray, T_camera_rack: FloatArray, rack: RackModel) -> RoughFit:
@@ -145,7 +145,7 @@ def refine(state: RoughFit, rack: RackModel) -> Fit:
 
 def rack_frame(state: RoughFit, rack: RackModel) -> FloatArray:
     """T_camera_rack of a fit, shape (4, 4), metres."""
-    return np.asarray(state.T_camera_top @ make_transform(np.eye(3), np.array([0.0, 0.0, -rack.height_m])))
+    return np.asarray(state.T_camera_top @ translation([0.0, 0.0, -rack.height_m]))
 
 
 def at_the_top(state: RoughFit) -> FloatArray:

@@ -22,7 +22,7 @@ from tubepose.rack.fit import to_frame, top_frame
 from tubepose.rack.lattice import SlotLattice, countable, other_pitch
 from tubepose.rack.pose import MIN_POINTS, RackPose, RackStatus
 from tubepose.rack.search import TURN_TRIES, Band, levels, turns
-from tubepose.transforms import FloatArray, make_transform
+from tubepose.transforms import FloatArray, make_transform, translation
 
 # Slots that the angle is looked for with, and how far and how finely it is turned about what was found.
 PROBE = 4
@@ -122,7 +122,7 @@ def _with_line(
     counts = counts + np.abs(side)
     grown = lattice.rack(int(counts[1]), int(counts[0]), walls_mm)
     half_step_m = side * np.array(lattice.pitch_mm) * 5e-4
-    return grown, T_camera_rack @ make_transform(np.eye(3), np.array([*half_step_m, 0.0]))
+    return grown, T_camera_rack @ translation([*half_step_m, 0.0])
 
 
 def _racks(points_m: FloatArray, lattice: SlotLattice, config: Config) -> Iterator[tuple[FloatArray, RackModel]]:

@@ -9,7 +9,7 @@ from tubepose.rack import view_kernels as view_kernels
 from tubepose.rack.evidence import likelier_step_m
 from tubepose.rack.fit import HOPELESS_SHARE, RoughFit, camera_place, rack_frame, roughly, top_frame
 from tubepose.rack.pose import MIN_POINTS
-from tubepose.transforms import FloatArray, make_transform
+from tubepose.transforms import FloatArray, translation
 
 # A rack full of caps shows its lattice better than its ends: so many slots may the search be off.
 SLOT_STEPS = 6
@@ -39,7 +39,7 @@ def on_lattice(points_m: FloatArray, T_camera_rack: FloatArray, rack: RackModel)
         if step_m is None or rough.stray > HOPELESS_SHARE:
             break
         been.append(rough.T_camera_top[:3, 3])
-        T_there = rack_frame(rough, rack) @ make_transform(np.eye(3), np.array([*step_m, 0.0]))
+        T_there = rack_frame(rough, rack) @ translation([*step_m, 0.0])
         if any(np.linalg.norm(T_there @ [0, 0, rack.height_m, 1] - [*place, 1]) < NEAR_STEP_M for place in been):
             break
         near_m, rough = look_at(points_m, T_there, rack)

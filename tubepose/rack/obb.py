@@ -28,7 +28,7 @@ from tubepose.preprocessing import (
 )
 from tubepose.rack.acceptance import agreement, outline_words, refusal, too_coarse
 from tubepose.rack.pose import MIN_POINTS, RackPose, RackStatus, choose_turn, unused_hint
-from tubepose.transforms import HALF_TURN, FloatArray, invert_transform, make_transform, transform_points
+from tubepose.transforms import HALF_TURN, FloatArray, invert_transform, make_transform, transform_points, translation
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -140,7 +140,7 @@ def _register_all(
     coarse = [_icp(few, target, start, config, config.icp_distances_m[:1]) for start in starts]
     if max((r.fitness for r in coarse), default=0.0) < config.min_fitness:
         # Few points above or below the band can turn the whole box; the band's own rectangle does not see them.
-        level_start = top.T_camera_top @ make_transform(np.eye(3), np.array([0.0, 0.0, -rack.height_m]))
+        level_start = top.T_camera_top @ translation([0.0, 0.0, -rack.height_m])
         coarse.append(_icp(few, target, level_start, config, config.icp_distances_m[:1]))
     best = max(coarse, key=lambda r: (round(r.fitness, 3), -r.inlier_rmse_m))
     fine = config.icp_distances_m[1:]

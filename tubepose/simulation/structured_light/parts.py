@@ -14,7 +14,7 @@ import numpy as np
 from tubepose.labware import CapModel, TubeModel, WallOptics
 from tubepose.simulation.scene import Label, Liquid, Material, PlacedTube, Scene
 from tubepose.simulation.structured_light.codes import CAVITY, FLAT, LINE, OPAQUE, OUTSIDE, SPHERE
-from tubepose.transforms import FloatArray, make_transform
+from tubepose.transforms import FloatArray, translation
 
 PROFILE_STEP_M = 1e-4
 # A lid closes a body this far inside its cap, and a cap reaches this far into the wall: a crooked cap leaves no gap.
@@ -241,7 +241,7 @@ def _own_cap(tube: PlacedTube, scene: Scene) -> RevolvedPart:
 def _printed_cap(tube: PlacedTube, cap: CapModel, material: Material) -> tuple[BoxPart, list[RevolvedPart]]:
     T_rack_cap = tube.T_rack_tube @ tube.T_tube_cap
     top, thickness, rim = cap.offset_m(tube.model), cap.thickness_mm * 1e-3, tube.model.rim_height_m
-    center = make_transform(np.eye(3), np.array([0.0, 0.0, top - thickness / 2]))
+    center = translation([0.0, 0.0, top - thickness / 2])
     plate = BoxPart(T_rack_cap @ center, np.array([cap.square_m, cap.square_m, thickness]) / 2, material)
     if top - thickness - rim < 1e-6:
         return plate, []
