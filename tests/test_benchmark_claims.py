@@ -14,31 +14,41 @@ CAPPED = load_tube("chen2023-tube-3")
 SESSION = SimpleNamespace(tubes={CAPPED.name: CAPPED})
 
 
-@pytest.fixture
-def few(monkeypatch):
-    monkeypatch.setattr(floor, "DRAWS", 3000)
-    monkeypatch.setattr(floor, "JUDGED", 60)
-
-
-def floor_of(top_std_m, slope_std):
+def floor_of(top_std_m, slope_std, **how):
     rng = np.random.default_rng(0)
-    held, slope = floor.draw(RACK, CAPPED, rng)
-    found = list(floor.posterior_means(held, slope, CAPPED, top_std_m, slope_std, rng))
-    return np.abs([entry[0] for entry in found]).mean(), np.abs(slope).mean()
+    answers = floor.ideal_answers(RACK, CAPPED, top_std_m, slope_std, rng, **({"judged": 60, "draws": 2000} | how))
+    return np.abs(answers.slope).mean()
 
 
-def test_the_floor_falls_with_what_is_known(few):
-    nothing, spread = floor_of(1.0, np.inf)
-    top_only, _ = floor_of(0.1e-3, np.inf)
-    both, _ = floor_of(0.1e-3, np.deg2rad(0.15))
-    assert nothing == pytest.approx(spread, rel=0.2)
-    assert both < 0.75 * top_only < 0.5 * nothing
+def test_the_floor_falls_with_what_is_known():
+    _, spread = floor.placed(RACK, CAPPED, 60, np.random.default_rng(0))
+    top_only, both, all_exact = (
+        floor_of(0.1e-3, np.inf),
+        floor_of(0.1e-3, np.deg2rad(0.15)),
+        floor_of(0.0, np.deg2rad(0.1)),
+    )
+    assert all_exact < both < 0.75 * top_only < 0.5 * np.abs(spread).mean()
 
 
-def test_a_crooked_cap_is_part_of_the_floor(few):
-    small, _ = floor_of(0.1e-3, np.deg2rad(0.1))
-    large, _ = floor_of(0.1e-3, np.deg2rad(0.3))
-    assert small < large
+def test_a_crooked_cap_is_part_of_the_floor():
+    assert floor_of(0.1e-3, np.deg2rad(0.1)) < floor_of(0.1e-3, np.deg2rad(0.3))
+
+
+def test_the_floor_does_not_depend_on_the_number_of_draws():
+    few, many = (floor_of(0.0, np.deg2rad(0.15), judged=200, draws=draws) for draws in (1000, 4000))
+    assert few == pytest.approx(many, rel=0.05)
+
+
+def test_a_floor_that_rests_on_too_few_draws_is_refused():
+    with pytest.raises(ArithmeticError, match="effective draws, 100 expected: raise DRAWS"):
+        floor_of(0.0, np.deg2rad(0.01))
+
+
+def test_what_the_floor_allows_is_what_the_simulator_places():
+    rng = np.random.default_rng(1)
+    held, slope = floor.placed(RACK, CAPPED, 200, rng)
+    assert floor.allowed(RACK, CAPPED, held, slope).mean() > 0.99
+    assert not floor.allowed(RACK, CAPPED, held, slope + 0.2).any()
 
 
 def errors(method, rx_deg, tx_mm, outcomes=("ok",)):

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
+from functools import cache
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from tubepose.capture.frame import CameraIntrinsics
@@ -121,24 +123,49 @@ def lean(rack: RackModel, slot: SlotModel, model: TubeModel, rng: np.random.Gene
     The bottom's offset is uniform in the disc of `floor_play_mm`, the axis at the height of the rack's top is uniform
     in what the opening leaves to the body's radius; pairs that would cut into the slot's wall are drawn again.
     """
-    z, r = model.outer_profile_m().T
-    inside = z <= rack.depth_m
-    pivot = model.pivot_height_m
-    above = min(rack.depth_m, model.height_m)
-    z, r = z[inside], r[inside]
-    if slot.shape == "round":
-        # A straight wall has no point of its profile at the rack's top, where `room` bounds square openings alone.
-        z, r = np.append(z, above), np.append(r, float(model.body_radius_m(above)))
-    room = np.maximum(slot.half_size_m - float(model.body_radius_m(above)) - CLEARANCE_M, 0.0)
+    room = play_at_top_m(rack, slot, model)
     for _ in range(_LEAN_TRIES):
         low = _in_disc(rng, rack.floor_play_mm * 1e-3)
         high = rng.uniform(-room, room)
-        slope = (high - low) / (above - pivot)
-        cos_tilt = 1 / np.sqrt(1 + slope @ slope)
-        centers = low + np.outer(z - pivot, slope)
-        if np.all(slot.signed_distance_m(centers + slot.center_m) <= -(r / cos_tilt + CLEARANCE_M)):
+        slope = (high - low) / (opening_height_m(rack, model) - model.pivot_height_m)
+        if clears_walls(rack, slot, model, low[None], slope[None])[0]:
             return _standing(rack, slot, model, low, slope)
     return _standing(rack, slot, model, np.zeros(2), np.zeros(2))
+
+
+@cache
+def _bounded_profile_m(rack: RackModel, slot: SlotModel, model: TubeModel) -> tuple[FloatArray, FloatArray]:
+    """Heights above the bottom and radii of the body between the slot's walls, metres."""
+    z, r = model.outer_profile_m().T
+    inside = z <= rack.depth_m
+    z, r = z[inside], r[inside]
+    if slot.shape == "round":
+        # A straight wall has no point of its profile at the rack's top, where the play bounds square openings alone.
+        above = opening_height_m(rack, model)
+        z, r = np.append(z, above), np.append(r, float(model.body_radius_m(above)))
+    return z, r
+
+
+def opening_height_m(rack: RackModel, model: TubeModel) -> float:
+    """Height above a tube's bottom at which the opening bounds it, metres."""
+    return min(rack.depth_m, model.height_m)
+
+
+def play_at_top_m(rack: RackModel, slot: SlotModel, model: TubeModel) -> FloatArray:
+    """How far the axis can be off the slot's centre at the rack's top, along x and y, shape (2,), metres."""
+    radius_m = float(model.body_radius_m(opening_height_m(rack, model)))
+    return np.maximum(slot.half_size_m - radius_m - CLEARANCE_M, 0.0)
+
+
+def clears_walls(
+    rack: RackModel, slot: SlotModel, model: TubeModel, low_m: FloatArray, slope: FloatArray
+) -> NDArray[np.bool_]:
+    """Which tubes stay inside their slot: pivots `low_m` off its centre and slopes dx/dz, dy/dz, shape (N, 2) each."""
+    z, r = _bounded_profile_m(rack, slot, model)
+    stretch = np.sqrt(1 + (slope**2).sum(axis=1))
+    centers = low_m[:, None] + (z - model.pivot_height_m)[:, None] * slope[:, None]
+    off = slot.signed_distance_m(centers + slot.center_m)
+    return np.asarray(np.all(off <= -(r * stretch[:, None] + CLEARANCE_M), axis=1))
 
 
 def _in_disc(rng: np.random.Generator, radius_m: float) -> FloatArray:
