@@ -18,6 +18,7 @@ import numpy as np
 import pandas as pd
 
 from tubepose.capture.session import Session, load_session
+from tubepose.errors import ConfigError, TubePoseError
 from tubepose.evaluation import compare, evaluate
 from tubepose.records import to_table
 from tubepose.report.writing import write_csv
@@ -37,33 +38,42 @@ AXES = ("rx_deg", "ry_deg", "tilt_deg", "tx_mm", "ty_mm", "tz_mm")
 
 def judge(session: Session, run: Path) -> dict[str, pd.DataFrame]:
     """Rows of errors.csv by the measured and by the exact truth."""
-    estimates = pd.read_csv(run / "estimates.csv", dtype={"seed": "Int64", "timestamp_ns": "Int64", "reason": "str"})
+    texts = dict.fromkeys(("session", "trial", "capture", "method", "slot", "tube", "reason"), "str")
+    whole = {"seed": "Int64", "timestamp_ns": "Int64"}
+    estimates, racks, measured = (
+        pd.read_csv(run / f"{name}.csv", dtype=texts | whole) for name in ("estimates", "racks", "ground_truth")
+    )
+    if (measured["reason"] == "exact").any():
+        raise ConfigError(f"{run}: judged by exact poses; expected a run of 'tubepose bench' without --exact-truth")
     estimates["reason"] = estimates["reason"].fillna("")
-    methods = list(estimates["method"].unique())
-    truths = {
-        "measured": pd.read_csv(run / "ground_truth.csv"),
-        "exact": to_table(exact_truth_rows(session), TRUTH_COLUMNS),
+    methods = list(racks["method"].unique())
+    seeds = {name: sorted(of["seed"].dropna().astype(int).unique()) for name, of in estimates.groupby("method")}
+    exact, _ = exact_truth_rows(session)
+    truths = {"measured": measured, "exact": to_table(exact, TRUTH_COLUMNS)}
+    return {
+        name: evaluate(estimates, truth, session.types, methods, racks=racks, seeds=seeds)
+        for name, truth in truths.items()
     }
-    return {name: evaluate(estimates, truth, session.tubes, methods) for name, truth in truths.items()}
 
 
 def accuracy_rows(errors: pd.DataFrame, session: Session, truth: str) -> list[dict[str, object]]:
     """Claim 1: accuracy per tube type, with its targets."""
     rows = []
-    models = {tube.name: tube for tube in session.tubes.values()}
+    models = session.types
     for tube in sorted(models):
-        of = errors[(errors["method"] == OURS) & (errors["tube"] == tube) & (errors["outcome"] != "false")]
+        named = errors[(errors["method"] == OURS) & (errors["tube"] == tube)]
+        of = named[named["outcome"] != "false"]
         ok = of[of["outcome"] == "ok"]
         size = ok[list(AXES)].abs()
-        offset_mm = np.sqrt((ok[["tx_mm", "ty_mm", "tz_mm"]] ** 2).sum(axis=1))
-        wrong = int(((ok["tilt_deg"] > WRONG) | (offset_mm > WRONG)).sum())
+        false = len(named) - len(of)
+        wrong = int(is_wrong(of).sum())
         limit = ROTATION_DEG[models[tube].is_open]
         means = size.mean()
         met = [
             means[["rx_deg", "ry_deg"]].max() <= limit,
             size["tilt_deg"].quantile(0.95) <= TILT_P95_DEG,
             means[["tx_mm", "ty_mm", "tz_mm"]].max() <= TRANSLATION_MM,
-            len(ok) >= 0.98 * len(of) and wrong == 0,
+            len(of) > 0 and len(ok) >= 0.98 * len(of) and wrong == false == 0,
         ]
         rows.append(
             {
@@ -78,6 +88,7 @@ def accuracy_rows(errors: pd.DataFrame, session: Session, truth: str) -> list[di
                 "T_z": means["tz_mm"],
                 "ok/expected": f"{len(ok)}/{len(of)}",
                 "wrong": wrong,
+                "false": false,
                 "R met": met[0],
                 "p95 met": met[1],
                 "T met": met[2],
@@ -85,6 +96,15 @@ def accuracy_rows(errors: pd.DataFrame, session: Session, truth: str) -> list[di
             }
         )
     return rows
+
+
+def is_wrong(rows: pd.DataFrame) -> pd.Series[bool]:
+    """Which accepted answers mislead: too far off, of another type than the tube's, or upside down."""
+    offset_mm = np.sqrt((rows[["tx_mm", "ty_mm", "tz_mm"]] ** 2).sum(axis=1))
+    other_type = ~rows["type_correct"].astype("boolean").fillna(True).astype(bool)
+    misleads = (rows["tilt_deg"] > WRONG) | (offset_mm > WRONG) | other_type
+    turned = (rows["outcome"] == "failed") & (rows["reason"] == "upside down")
+    return ((rows["outcome"] == "ok") & misleads) | turned
 
 
 def rival_rows(errors: pd.DataFrame, truth: str) -> list[dict[str, object]]:
@@ -97,6 +117,7 @@ def rival_rows(errors: pd.DataFrame, truth: str) -> list[dict[str, object]]:
         for entry in group.to_dict("records"):
             low, high = entry["ci95_low"], entry["ci95_high"]
             verdict = "ahead" if low > 0 else "behind" if high < 0 else "level"
+            verdict = verdict if np.isfinite([low, high]).all() else "too few captures"
             row[str(entry["error"])] = f"{entry['mean_difference']:+.2f} ({low:+.2f} to {high:+.2f}) {verdict}"
         row["pairs"] = int(group["n_pairs"].iloc[0])
         rows.append(row)
@@ -155,8 +176,12 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("run", type=Path)
     parser.add_argument("--out", type=Path, help="Folder for the rows as CSV.")
     options = parser.parse_args(arguments)
-    session = load_session(options.session)
-    judged = judge(session, options.run)
+    try:
+        session = load_session(options.session)
+        judged = judge(session, options.run)
+    except TubePoseError as problem:
+        print(f"error: {problem}", file=sys.stderr)
+        return 1
     tables = {
         "accuracy": [row for name, errors in judged.items() for row in accuracy_rows(errors, session, name)],
         "rivals": [row for name, errors in judged.items() for row in rival_rows(errors, name)],

@@ -113,7 +113,7 @@ GROUPS: dict[str, tuple[str, Callable[[], Iterator[tuple[str, Config]]]]] = {
 def session_jobs_of(session: Session, known_rack: bool) -> list[Job]:
     """One job per trial, with the rack's exact pose if that is asked for."""
     jobs = session_jobs(session)[0]
-    return with_exact_rack(jobs, session) if known_rack else jobs
+    return with_exact_rack(jobs, session)[0] if known_rack else jobs
 
 
 def compare(

@@ -134,15 +134,15 @@ def judge(
 ) -> tuple[pd.DataFrame, str]:
     """Rows of errors.csv of a session by its exact truth, and how many racks of how many were accepted."""
     jobs, problems = session_jobs(session)
-    jobs = with_exact_rack(jobs, session) if known_rack else jobs
+    jobs = with_exact_rack(jobs, session)[0] if known_rack else jobs
     boxes = not known_rack or any(method in TUBE_METHODS for method in methods)
     tables = run_jobs(
         jobs, methods, lambda rack, tubes: GeometricDetector(rack, tubes, config) if boxes else NoBoxes(), config
     )
     for problem in (*problems, *tables.problems):
         print(f"error: {problem}", file=sys.stderr)
-    models = {tube.name: tube for tube in session.tubes.values()}
-    truth = to_table(exact_truth_rows(session), TRUTH_COLUMNS)
+    models = session.types
+    truth = to_table(exact_truth_rows(session)[0], TRUTH_COLUMNS)
     errors = evaluate(to_table(tables.estimates, ESTIMATE_COLUMNS), truth, models, methods)
     racks = pd.DataFrame(tables.racks, columns=["trial", "method", "status"]).drop_duplicates("trial")
     return errors, f"{(racks['status'] == 'ok').sum()}/{len(session.trials)}"

@@ -17,6 +17,11 @@ if TYPE_CHECKING:
     from tubepose.config import Config
     from tubepose_cli.truth import MeasuredTruth
 
+JUDGED_FILES = (
+    "errors.csv", "summary.csv", "comparison.csv", "uncertainty.csv", "coverage.csv", "confusion.csv", "seeds.csv",
+    "slot_accuracy.csv", *(f"table_{kind}.{form}" for kind in ("accuracy", "timing") for form in ("csv", "md", "tex")),
+)  # fmt: skip
+"""What only a run with truth writes: of an earlier one nothing stays beside other estimates."""
 ALL_METHODS = "upright,profile,paper,slot-icp,global-icp"
 
 
@@ -59,6 +64,7 @@ def bench(
     from tubepose.batch import session_jobs
     from tubepose.config import load_config
     from tubepose.errors import TubePoseError
+    from tubepose.report.writing import remove_files
     from tubepose.truth_tables import with_exact_rack
     from tubepose_cli.inputs import find_sessions, make_detector, read_methods, sample_session, used_model
     from tubepose_cli.results import run_estimates
@@ -75,9 +81,12 @@ def bench(
         try:
             found, unread = session_jobs(session, fail_fast=fail_fast)
             if all_tubes:
-                found = [replace(job, tubes=tuple(session.tubes.values())) for job in found]
-            jobs += with_exact_rack(found, session) if known_rack else found
+                found = [replace(job, tubes=tuple(session.types.values())) for job in found]
             problems += unread
+            if known_rack:
+                found, unread = with_exact_rack(found, session, fail_fast=fail_fast)
+                problems += unread
+            jobs += found
         except TubePoseError as problem:
             if fail_fast:
                 raise
@@ -88,8 +97,11 @@ def bench(
             *(path for path in (used_model(detector, model), boxes, classes, config) if path is not None),
             *(session.folder for session in measured.sessions),
         ],
+        labware=[] if exact_truth else [s.printed_cap for s in measured.sessions if s.printed_cap is not None],
         problems=[*problems, *measured.problems], detector=detector, ground_truth_config=measured.config,
     )  # fmt: skip
+    if not len(measured.truth):
+        remove_files(out, JUDGED_FILES)
     if len(measured.truth):
         _report(tables, measured, jobs, names, settings, out, seeds, published)
     elif measured.sessions and not exact_truth:
@@ -105,15 +117,18 @@ def _report(
     from tubepose.confusion import confusion
     from tubepose.evaluation import compare, evaluate, seed_spread, slot_accuracy, summarise
     from tubepose.pipeline import STOCHASTIC
-    from tubepose.records import ESTIMATE_COLUMNS, SLOT_COLUMNS, TIMING_COLUMNS, to_table
+    from tubepose.records import ESTIMATE_COLUMNS, RACK_COLUMNS, SLOT_COLUMNS, TIMING_COLUMNS, to_table
     from tubepose.report.tables import accuracy_table, timing_table
     from tubepose.report.writing import write_csv, write_table
     from tubepose.uncertainty import coverage, uncertainty
     from tubepose_cli.show import say, show_table
 
     estimates = to_table(tables.estimates, ESTIMATE_COLUMNS)
-    tube_models = {tube.name: tube for session in measured.sessions for tube in session.tubes.values()}
-    errors = evaluate(estimates, measured.truth, tube_models, methods)
+    tube_models = {name: tube for session in measured.sessions for name, tube in session.types.items()}
+    errors = evaluate(
+        estimates, measured.truth, tube_models, methods,
+        racks=to_table(tables.racks, RACK_COLUMNS), seeds={method: range(seeds) for method in STOCHASTIC},
+    )  # fmt: skip
     summary = summarise(errors, methods)
     write_csv(out / "errors.csv", errors)
     write_csv(out / "summary.csv", summary)
@@ -149,7 +164,7 @@ def _data_note(measured: MeasuredTruth, jobs: Sequence[Job]) -> str:
 
 
 def _rack_notes(tables: Tables) -> list[str]:
-    frames = {(row["session"], row["capture"], row["frame"]): row["status"] for row in tables.racks}
+    frames = {(row["session"], row["trial"], row["capture"], row["frame"]): row["status"] for row in tables.racks}
     ok = sum(status == "ok" for status in frames.values())
     return [f"Racks: {ok} of {len(frames)} frames with an accepted pose."]
 

@@ -5,9 +5,12 @@ from __future__ import annotations
 import math
 import sys
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
+
+if TYPE_CHECKING:
+    from tubepose.records import Row
 
 
 def estimate(
@@ -110,9 +113,12 @@ def estimate(
         ],
         problems=problems, detector=detector,
     )  # fmt: skip
+    with_rack = {_capture_of(row) for row in tables.racks if row["rack"]}
     for row in tables.racks:
         if not row["rack"]:
-            continue  # its reason is among the problems
+            if _capture_of(row) in with_rack:  # else its reason is among the problems
+                say(f"{row['capture']} frame {row['frame']}: {row['status']}: {row['reason']}")
+            continue
         settle = row["hint_note"] or "--hint SLOT@U,V settles it"
         turn = f", turn ambiguous by 180 degrees (slot names may be swapped; {settle})" if row["ambiguous"] else ""
         if row["status"] == "ok":
@@ -132,3 +138,7 @@ def estimate(
     if tubes is None and any(not job.tubes for job in jobs):
         say("no --tubes given: only the rack and its slots are estimated")
     finish([*problems, *tables.problems])
+
+
+def _capture_of(row: Row) -> tuple[str, str, str]:
+    return row["session"], row["trial"], row["capture"]

@@ -34,9 +34,9 @@ def sample_session() -> Path:
 
 def read_tubes(names: str) -> tuple[TubeModel, ...]:
     """Tube models of a comma-separated list of names and files."""
-    from tubepose.labware import load_tube
+    from tubepose.labware import load_tube, unique_tubes
 
-    return tuple(load_tube(name.strip()) for name in names.split(",") if name.strip())
+    return unique_tubes([load_tube(name.strip()) for name in names.split(",") if name.strip()], "--tubes")
 
 
 def read_methods(names: str) -> tuple[str, ...]:
@@ -211,7 +211,7 @@ def make_detector(
         from tubepose.detection.yolo import YoloDetector
 
         names = read_class_names(classes) if classes is not None else None
-        yolo = YoloDetector(model or bundled_model(), classes=names, layout=layout)
+        yolo = YoloDetector(model or bundled_model(), classes=names, layout=layout, threads=1)  # as all that is timed
         return lambda rack, tubes: AssistedDetector(yolo, GeometricDetector(rack, tubes, config))
     if name == "recorded":
         if boxes is None:

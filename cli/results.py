@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from tubepose.batch import DetectorFactory, Job, Tables, UnnamedJob
     from tubepose.config import Config
+    from tubepose.labware import Labware
     from tubepose.pipeline import Scene, TubeEstimate
 
 
@@ -25,12 +26,13 @@ def run_estimates(
     fail_fast: bool = False,
     warm_up: bool = False,
     inputs: Sequence[Path] = (),
+    labware: Sequence[Labware] = (),
     problems: Sequence[str] = (),
     **more: Any,
 ) -> Tables:
     """Run jobs and write racks.csv, slots.csv, estimates.csv, timings.csv, run.json and overlays/ into `out`.
 
-    `problems` are those from before, for the record.
+    `problems` are those from before, and `labware` what was used besides, for the record.
     """
     from tubepose.batch import run_jobs
     from tubepose.provenance import pinned_threads, run_record
@@ -55,7 +57,7 @@ def run_estimates(
     record = run_record(
         command,
         config,
-        list(tables.labware.values()),
+        [*tables.labware.values(), *labware],
         [*inputs, *dict.fromkeys(job.capture.path for job in jobs if job.capture.path.exists())],
         methods=list(methods),
         seeds=list(range(seeds)),
@@ -74,6 +76,8 @@ def write_overlay(folder: Path, job: Job, scene: Scene, estimates: Sequence[Tube
     from tubepose.report.overlay import draw_overlay
     from tubepose.report.writing import write_bytes
 
-    name = "-".join(part for part in (job.session, scene.frame.capture) if part).replace("/", "_")
+    capture = scene.frame.capture
+    trial = "" if job.trial in capture else job.trial  # trials may call their captures by the same name
+    name = "-".join(part for part in (job.session, trial, capture) if part).replace("/", "_")
     _, png = cv2.imencode(".png", draw_overlay(scene, estimates))
     write_bytes(folder / f"{name}-{scene.frame.index:04d}.png", png.tobytes())

@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     from tubepose.capture.session import Session
 
 
+FLOOR_FILE = "ground_truth_floor.csv"
 EXACT_NOTE = "Truth: the exact poses of the simulation, not those measured from printed caps."
 
 
@@ -51,7 +52,7 @@ def measure_sessions(
     from tubepose.ground_truth import GroundTruthConfig
     from tubepose.provenance import pinned_threads
     from tubepose.records import to_table
-    from tubepose.report.writing import make_folder, write_csv
+    from tubepose.report.writing import make_folder, remove_files, write_csv
     from tubepose.truth_tables import (
         FLOOR_COLUMNS,
         TRUTH_COLUMNS,
@@ -72,6 +73,7 @@ def measure_sessions(
             if twin is not None:
                 same = f"its session name '{session.name}' is that of {twin.folder} too"
                 raise CaptureError(f"{folder}: {same}; change 'name' in one of them")
+            _refuse_other_definitions(session, sessions)
             sessions.append(session)
         except TubePoseError as problem:
             if fail_fast:
@@ -86,7 +88,9 @@ def measure_sessions(
                 measure_session(session, tables, config, fail_fast=fail_fast, on_done=step)
                 continue
             try:
-                tables.truth += exact_truth_rows(session)
+                rows, unread = exact_truth_rows(session, fail_fast=fail_fast)
+                tables.truth += rows
+                tables.problems += unread
             except TubePoseError as problem:
                 if fail_fast:
                     raise
@@ -95,6 +99,26 @@ def measure_sessions(
     write_csv(out / "ground_truth.csv", truth)
     notes = [EXACT_NOTE if exact else refused_note(truth)]
     if len(floor):
-        write_csv(out / "ground_truth_floor.csv", floor)
+        write_csv(out / FLOOR_FILE, floor)
         notes.append(floor_note(floor))
+    else:
+        remove_files(out, [FLOOR_FILE])
     return MeasuredTruth(tuple(sessions), truth, floor, tuple(notes), (*problems, *tables.problems), asdict(config))
+
+
+def _refuse_other_definitions(session: Session, others: Sequence[Session]) -> None:
+    """Tables know labware by name: one name has to mean one thing in a run.
+
+    Raises:
+        CaptureError: Another session has other labware of the same name.
+    """
+    from tubepose.errors import CaptureError
+
+    for other in others:
+        known = {other.rack.name: other.rack, **other.types}
+        for name, item in {session.rack.name: session.rack, **session.types}.items():
+            if known.get(name, item) != item:
+                raise CaptureError(
+                    f"{session.folder}: '{name}' is defined otherwise than in {other.folder}; "
+                    "give one of them another name, or run the sessions one by one"
+                )

@@ -90,6 +90,13 @@ def test_fail_fast_raises_the_first_problem() -> None:
         run(job("good", GOOD), job("bad", problem=CaptureError("cut")), fail_fast=True)
 
 
+def test_warm_up_goes_on_until_there_were_tubes() -> None:
+    empty = replace(GOOD, cloud_m=GOOD.cloud_m[:, :5])
+    tables = run(job("empty", empty), job("good", GOOD), job("good", GOOD), warm_up=True)
+    tubes = [row["warmup"] for row in tables.timings if row["stage"] == "tube"]
+    assert tubes == [True, False, False]
+
+
 def test_our_own_bugs_are_not_kept_as_problems() -> None:
     with pytest.raises(ZeroDivisionError):
         run(job("bug", problem=ZeroDivisionError()))

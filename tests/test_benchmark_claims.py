@@ -11,7 +11,7 @@ from tubepose.labware import load_rack, load_tube
 
 RACK = load_rack("chen2023-soft-5x10")
 CAPPED = load_tube("chen2023-tube-3")
-SESSION = SimpleNamespace(tubes={CAPPED.name: CAPPED})
+SESSION = SimpleNamespace(types={CAPPED.name: CAPPED})
 
 
 def floor_of(top_std_m, slope_std, **how):
@@ -59,7 +59,8 @@ def errors(method, rx_deg, tx_mm, outcomes=("ok",)):
                 {
                     "session": "s", "trial": f"t{trial}", "slot": f"A{slot}", "tube": CAPPED.name, "method": method,
                     "outcome": outcome, "rx_deg": rx_deg, "ry_deg": 0.0, "tilt_deg": abs(rx_deg), "tx_mm": tx_mm,
-                    "ty_mm": 0.0, "tz_mm": 0.0, "cap_mm": 0.0,
+                    "ty_mm": 0.0, "tz_mm": 0.0, "cap_mm": 0.0, "type_correct": True,
+                    "reason": "upside down" if outcome == "failed" else "",
                 }
             )  # fmt: skip
     return pd.DataFrame(rows)
@@ -74,11 +75,32 @@ def errors(method, rx_deg, tx_mm, outcomes=("ok",)):
         (0.1, 0.3, ("ok",), (True, True, False, True)),
         (0.1, 2.1, ("ok",), (True, True, False, False)),
         (0.1, 0.1, ("ok", "missed"), (True, True, True, False)),
+        (0.1, 0.1, ("ok",) * 99 + ("missed",), (True, True, True, True)),
+        (0.1, 0.1, ("ok",) * 99 + ("failed",), (True, True, True, False)),
+        (0.1, 0.1, ("ok",) * 99 + ("false",), (True, True, True, False)),
     ],
 )
 def test_targets_are_met_or_not(rx_deg, tx_mm, outcomes, verdicts):
     (row,) = claims.accuracy_rows(errors("profile", rx_deg, tx_mm, outcomes), SESSION, "exact")
     assert (row["R met"], row["p95 met"], row["T met"], row["kept, none wrong"]) == verdicts
+
+
+def test_what_is_wrong_is_counted_whatever_kind_of_wrong():
+    rows = errors("profile", 0.1, 0.1, ("ok", "ok", "failed", "false", "rejected")).iloc[:5]
+    rows["type_correct"] = pd.array([True, False, True, None, False], dtype="boolean")
+    (row,) = claims.accuracy_rows(rows, SESSION, "exact")
+    assert (row["wrong"], row["false"], row["ok/expected"]) == (2, 1, "2/4")
+
+
+def test_no_expected_tube_meets_nothing():
+    (row,) = claims.accuracy_rows(errors("profile", 0.1, 0.1).iloc[:0], SESSION, "exact")
+    assert not any(row[name] for name in ("R met", "p95 met", "T met", "kept, none wrong"))
+
+
+def test_an_interval_of_one_capture_says_nothing():
+    table = pd.concat([errors("profile", 0.1, 0.1).iloc[:1], errors("worse", 0.3, 0.1).iloc[:1]])
+    (told,) = claims.rival_rows(table, "exact")
+    assert told["rx_deg"].endswith("too few captures")
 
 
 def test_rivals_are_behind_level_or_ahead():

@@ -165,7 +165,8 @@ def test_the_run_record_has_what_the_page_says(
         assert keys <= set(record)
         assert record["command"][0] == "tubepose"
         assert record["problems"] == []
-        assert {SMALL_RACK, *SMALL_TUBES} == set(record["labware_sha256"])
+        cap = {"printed-square-16.7"} if out == benched[0] else set()
+        assert {SMALL_RACK, *SMALL_TUBES} | cap == set(record["labware_sha256"])
         assert str(small_session) in record["inputs_sha256"]
         digests_found = [*record["labware_sha256"].values(), *record["inputs_sha256"].values()]
         assert all(re.fullmatch("[0-9a-f]{64}", digest) for digest in digests_found)
@@ -772,3 +773,71 @@ def test_a_folder_of_sessions_is_each_of_them(small_session: Path, tmp_path: Pat
     ended = tubepose("estimate", above, "--method", "upright", "--no-overlays", "--out", tmp_path / "out")
     assert ended.errors == []
     assert set(table(tmp_path / "out" / "racks.csv")["session"]) == {"one", "two"}
+
+
+# What an earlier run, another trial or another session left
+
+
+def test_judged_files_of_an_earlier_run_do_not_stay_beside_other_estimates(small_session: Path, tmp_path: Path) -> None:
+    arguments = ("--methods", "upright", "--out", tmp_path / "out")
+    assert tubepose("bench", small_session, *arguments).code == 0
+    judged = {"errors.csv", "summary.csv", "table_accuracy.md", "ground_truth_floor.csv"}
+    assert judged <= {path.name for path in (tmp_path / "out").iterdir()}
+    bare = edited(small_session, tmp_path / "bare", str)
+    shutil.rmtree(bare / "simulation_truth")
+    assert tubepose("bench", bare, "--exact-truth", *arguments).code == 1
+    left = {path.name for path in (tmp_path / "out").iterdir()}
+    assert not left & judged
+    assert "estimates.csv" in left
+
+
+def test_trials_may_call_their_captures_by_the_same_name(small_session: Path, tmp_path: Path) -> None:
+    copy = edited(
+        small_session, tmp_path / "s", lambda text: re.sub(r"captures/(.+)-original", r"captures/\1/original", text)
+    )
+    for path in sorted((copy / "captures").glob("*-original*")):
+        place = path.parent / path.name.removesuffix("-original")
+        place.mkdir()
+        path.rename(place / "original")
+    ended = tubepose("bench", copy, "--methods", "upright", "--overlays", "--out", tmp_path / "out")
+    assert ended.code == 0, ended.err
+    assert "Racks: 2 of 2 frames with an accepted pose." in ended.out
+    names = sorted(path.name for path in (tmp_path / "out" / "overlays").iterdir())
+    assert len(names) == 2
+    for name, tube in zip(names, sorted(SMALL_TUBES), strict=True):
+        assert name.endswith(f"-{tube}-001-original-0000.png")
+
+
+def test_one_name_means_one_thing_in_a_run(small_session: Path, tmp_path: Path) -> None:
+    def other(text: str) -> str:
+        return re.sub(r": blood-16x100(?=[,}\n])", ": mine.yaml", text.replace("name: raycast", "name: other"))
+
+    session = edited(small_session, tmp_path / "s", other)
+    mine = load_tube("blood-16x100").model_dump(mode="json", exclude_none=True)
+    (session / "mine.yaml").write_text(yaml.safe_dump(mine), encoding="utf-8")
+    run = ("bench", small_session, session, "--methods", "upright", "--out", tmp_path / "out")
+    assert tubepose(*run).code == 0  # the same tube, by another name
+    mine["source"] = "another calliper"
+    (session / "mine.yaml").write_text(yaml.safe_dump(mine), encoding="utf-8")
+    ended = tubepose(*run)
+    (line,) = ended.errors
+    assert f"{session}: 'blood-16x100' is defined otherwise than in {small_session}" in line
+    assert len(table(tmp_path / "out" / "ground_truth.csv")) == 4  # the first session is done
+
+
+def test_the_exact_rack_of_one_trial_is_enough_for_that_trial(small_session: Path, tmp_path: Path) -> None:
+    copy = edited(small_session, tmp_path / "s", str)
+    (copy / "simulation_truth" / "blood-16x100-001.yaml").unlink()
+    ended = tubepose("bench", copy, "--known-rack", "--exact-truth", "--methods", "upright", "--out", tmp_path / "out")
+    assert ended.code == 1
+    assert all("blood-16x100-001.yaml: no such file" in line for line in ended.errors)
+    racks = table(tmp_path / "out" / "racks.csv")
+    assert racks["trial"].tolist() == ["chen2023-tube-3-001"]
+
+
+def test_detection_runs_on_one_thread_as_the_tables_say() -> None:
+    from tubepose_cli.inputs import make_detector
+
+    detector = make_detector("yolo", None, None, None, None, Config())(load_rack(SMALL_RACK), ())
+    options = detector.yolo._session.runtime.get_session_options()
+    assert options.intra_op_num_threads == 1

@@ -387,3 +387,22 @@ def test_a_summary_of_nothing_keeps_its_columns():
     judged = evaluate(estimates, TRUTH, TUBES, ["paper"])
     assert summarise(refused, ["paper"]).columns.tolist() == summarise(judged).columns.tolist()
     assert len(summarise(refused, ["paper"])) == 0
+
+
+def test_the_first_frame_is_judged_whatever_was_found_in_it():
+    truth = table([truth_row("t", "A1")])
+    estimates = table([estimate_row("t", "A1", method="profile", frame=1), estimate_row("t", "A1", frame=1)])
+    racks = pd.DataFrame([{"session": "s", "trial": "t", "method": "profile", "frame": frame} for frame in (0, 1)])
+    alone = evaluate(estimates, truth, TUBES, ["profile"], racks=racks)
+    both = evaluate(estimates, truth, TUBES, ["profile", "paper"], racks=racks)
+    assert alone["outcome"].tolist() == ["missed"]
+    assert both["outcome"].tolist() == ["missed", "missed"]
+    assert evaluate(estimates, truth, TUBES, ["profile"], racks=racks[1:])["outcome"].tolist() == ["ok"]
+
+
+def test_a_seed_that_answered_nothing_is_counted():
+    truth = table([truth_row("t", "A1")])
+    estimates = table([estimate_row("t", "A1", method="global-icp", seed=0)])
+    errors = evaluate(estimates, truth, TUBES, ["global-icp", "paper"], seeds={"global-icp": range(3)})
+    assert errors["outcome"].tolist() == ["ok", "missed", "missed", "missed"]
+    assert errors["seed"].tolist() == [0, 1, 2, pd.NA]

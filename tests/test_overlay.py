@@ -117,6 +117,18 @@ def test_a_cloud_without_pixels_is_seen_from_above() -> None:
     assert pixels_of(picture, COLORS_BGR["ok"]) > 200
 
 
+def test_a_cloud_without_pixels_and_rack_is_seen_as_the_camera_sees_it() -> None:
+    u, v = np.meshgrid(np.linspace(-0.1, 0.1, 60), np.linspace(-0.1, 0.1, 60))
+    cloud = np.stack([u, v, np.where((u < 0) & (v < 0), 0.5, 0.6)], axis=-1).reshape(1, -1, 3)  # top left is near
+    frame = RgbdFrame(cloud, None, None, None, "wall", organised=False)
+    scene = prepare_scene(frame, RACK, (TUBE,), Fixed(()), CONFIG)
+    picture = draw_overlay(scene, ())[..., 0].astype(float)
+    rows, columns = np.array(picture.shape) // 2
+    bright = picture > 200
+    near = bright[:rows, :columns].sum()
+    assert near > 0.8 * bright.sum() > 0
+
+
 def test_a_frame_without_points_is_drawn_too() -> None:
     nothing = np.full((48, 64, 3), np.nan)
     for organised in (True, False):

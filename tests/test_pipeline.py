@@ -350,10 +350,10 @@ def test_a_slot_with_two_finds_has_one_row_and_it_is_the_first(seen):
 # What a detector's classes say of the types
 
 
-def top_box(slot, tube, class_name, half_px=14.0, off_px=0.0):
+def top_box(slot, tube, class_name, half_px=14.0, off_px=0.0, score=0.9):
     top = np.array([*RACK.slot(slot).center_m, RACK.floor_m + tube.height_m])
     u, v = seen_camera().project(transform_points(T_CAMERA_RACK, top)) + off_px
-    return Detection(class_name, 0.9, (u - half_px, v - half_px, u + half_px, v + half_px), "recorded")
+    return Detection(class_name, score, (u - half_px, v - half_px, u + half_px, v + half_px), "recorded")
 
 
 def seen_camera():
@@ -374,9 +374,10 @@ def test_a_box_of_a_known_class_leaves_its_slot_that_type_alone(seen):
 
 
 def test_the_better_of_two_boxes_of_a_slot_tells_its_type(seen):
-    may = told(seen, top_box("C5", TUBES[2], "white-cap"), top_box("C5", TUBES[1], "purple-cap"))
+    better, worse = top_box("C5", TUBES[2], "white-cap"), top_box("C5", TUBES[1], "purple-cap", score=0.8)
     slot = [slot.name for slot in RACK.all_slots].index("C5")
-    assert may[:, slot].tolist() == [False, False, True]
+    for boxes in ((better, worse), (worse, better)):
+        assert told(seen, *boxes)[:, slot].tolist() == [False, False, True]
 
 
 def test_boxes_that_say_no_type_leave_all(seen):

@@ -8,6 +8,7 @@ import yaml
 
 from tubepose.capture.session import is_session, load_session
 from tubepose.errors import CaptureError, LabwareError
+from tubepose.labware import load_tube
 
 
 def session_keys(**changes) -> dict[str, Any]:
@@ -50,6 +51,18 @@ def test_session_is_read_with_its_labware(tmp_path):
     assert first.hint is not None
     assert (first.hint.slot, first.hint.pixel) == ("A1", (412.0, 300.0))
     assert (second.printed, second.hint, session.tubes_of(second)) == (None, None, ())
+
+
+def test_a_tube_that_is_named_in_two_ways_is_one_type(tmp_path):
+    mine = load_tube("chen2023-tube-1").model_dump(mode="json", exclude_none=True)
+    tubes = {"A1": "chen2023-tube-1", "B3": "mine.yaml"}
+    (tmp_path / "mine.yaml").write_text(yaml.safe_dump(mine), encoding="utf-8")
+    session = load_session(write_session(tmp_path, trials=[trial(tubes=tubes)]))
+    assert [tube.name for tube in session.tubes_of(session.trials[0])] == ["chen2023-tube-1"]
+    assert session.types == {"chen2023-tube-1": load_tube("chen2023-tube-1")}
+    (tmp_path / "mine.yaml").write_text(yaml.safe_dump(mine | {"source": "another calliper"}), encoding="utf-8")
+    with pytest.raises(LabwareError, match="two different tubes are named 'chen2023-tube-1'; give one of them another"):
+        load_session(tmp_path)
 
 
 def test_session_file_and_folder_are_the_same(tmp_path):

@@ -77,6 +77,9 @@ def test_without_a_pose_or_a_covariance_there_is_no_square() -> None:
     lost, unstated = T.copy(), covariance.copy()
     lost[0], unstated[1] = np.nan, np.nan
     assert np.isnan(squared_mahalanobis(T, lost, unstated)).tolist() == [True, True, False]
+    singular = np.tile(np.eye(5), (3, 1, 1))
+    singular[0], singular[1] = 0.0, -np.eye(5)
+    assert np.isnan(squared_mahalanobis(T, T, singular)).tolist() == [True, True, False]
 
 
 # Columns

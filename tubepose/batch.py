@@ -144,7 +144,7 @@ def run_jobs(
         detector_for: Makes the source of boxes for a rack and the tubes that can stand in it.
         config: All sections.
         seeds: Seeds of a stochastic method: 0, 1, ... (a deterministic method runs once).
-        warm_up: Run the first frame once more before, with its timings marked.
+        warm_up: Run the first frame with tubes, and those before it, once more before, with their timings marked.
         fail_fast: Raise the first problem instead of keeping it.
         on_scene: Called with each frame's result by one of the methods, ours if it is among them (overlays).
         on_done: Called after each job (progress).
@@ -154,8 +154,9 @@ def run_jobs(
         try:
             for named, frame, load_ms in _named_frames(job, methods, tables):
                 if warm_up:
-                    warm_up = False
-                    _run_frame(named, frame, methods, detector_for, config, seeds, Tables(), tables.timings)
+                    warm = Tables()
+                    _run_frame(named, frame, methods, detector_for, config, seeds, warm, tables.timings)
+                    warm_up = not warm.estimates  # a frame without tubes warms half of it
                 load = StageTime("load", "all", "", None, load_ms)
                 _run_frame(named, frame, methods, detector_for, config, seeds, tables, None, load, on_scene)
         except TubePoseError as problem:

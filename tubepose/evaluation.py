@@ -47,31 +47,36 @@ _RANK = {"ok": 0, "rejected": 1, "failed": 2}
 
 
 def evaluate(
-    estimates: pd.DataFrame, truth: pd.DataFrame, tube_models: Mapping[str, TubeModel], methods: Sequence[str]
-) -> pd.DataFrame:
+    estimates: pd.DataFrame, truth: pd.DataFrame, tube_models: Mapping[str, TubeModel], methods: Sequence[str],
+    *, racks: pd.DataFrame | None = None, seeds: Mapping[str, Sequence[int]] | None = None,
+) -> pd.DataFrame:  # fmt: skip
     """Judge every expected tube for every method and seed, and list accepted estimates that nothing was expected for.
 
-    Expected are the slots whose truth is ok. A trial is judged on the first frame that has estimates. Where several
-    estimates claim one slot, an accepted one goes before a rejected one, then the higher score; accepted ones that are
-    left over are false. Slots whose truth was refused are neither expected nor false; trials without truth are left
-    out.
+    Expected are the slots whose truth is ok. A trial is judged on its first frame, whatever was found in it. Where
+    several estimates claim one slot, an accepted one goes before a rejected one, then the higher score; accepted ones
+    that are left over are false. Slots whose truth was refused are neither expected nor false; trials without truth
+    are left out.
 
     Args:
         estimates: Rows of estimates.csv.
         truth: Rows of ground_truth.csv (or of the simulator's exact truth), one per session, trial and slot.
         tube_models: The model of every tube that the truth names, for the errors at the cap and on the surface.
         methods: Methods to judge, in the order of the result; one without estimates has all its tubes missed.
+        racks: Rows of racks.csv, which know every frame; without them a trial's first frame is the first one with an
+            estimate of any method.
+        seeds: Seeds that stochastic methods ran with, so that one that answered nothing counts; by default those that
+            have estimates.
 
     Returns:
-        Rows of errors.csv, columns ERROR_COLUMNS: outcome ``ok``, ``rejected`` (there is a pose, with its errors),
+        Rows of errors.csv, columns ERROR_COLUMNS: outcome ``ok``, ``rejected`` (with errors where there is a pose),
         ``missed`` (no estimate), ``failed`` (no pose, or upside down) or ``false``; errors as in `PoseErrors`.
     """
     # Tables from before covariances were stated, and methods that state none.
     estimates = estimates.assign(**{name: np.nan for name in COVARIANCE_COLUMNS if name not in estimates})
-    judged = _judged(estimates, truth, methods)
+    judged = _judged(estimates, truth, methods, estimates if racks is None else racks)
     best = judged[judged["slot"].notna() & ~judged.duplicated(_MATCH)]
     columns = [*_MATCH, "tube", "status", "reason", "score", *_POSE, *COVARIANCE_COLUMNS]
-    rows = _expected(estimates, truth, judged, methods).merge(
+    rows = _expected(estimates, truth, judged, methods, seeds or {}).merge(
         best[columns], how="left", on=_MATCH, suffixes=("", "_estimated"), validate="one_to_one"
     )
     rows["type_correct"] = (
@@ -84,14 +89,15 @@ def evaluate(
     return table.iloc[np.argsort(rank.to_numpy(), kind="stable")].reset_index(drop=True)
 
 
-def _judged(estimates: pd.DataFrame, truth: pd.DataFrame, methods: Sequence[str]) -> pd.DataFrame:
+def _judged(estimates: pd.DataFrame, truth: pd.DataFrame, methods: Sequence[str], frames: pd.DataFrame) -> pd.DataFrame:
     """Estimates of the named methods in trials with truth, first frame only, the best claim to a slot first."""
     unknown = sorted(set(estimates["status"]) - set(_RANK))
     if unknown:
         raise ValueError(f"expected status ok, rejected or failed, found {', '.join(map(str, unknown))}")
     trials = truth[_TRIAL].drop_duplicates()
     rows = estimates[estimates["method"].isin(list(methods))].merge(trials, on=_TRIAL)
-    rows = rows[rows["frame"] == rows.groupby(_TRIAL)["frame"].transform("min")]
+    first = frames.groupby(_TRIAL, as_index=False)["frame"].min()
+    rows = rows.merge(first, on=[*_TRIAL, "frame"])
     rows = rows.assign(seed_key=_seed_key(rows), rank=rows["status"].map(_RANK))
     return rows.sort_values(["rank", "score"], ascending=[True, False], kind="stable").drop(columns="rank")
 
@@ -102,13 +108,17 @@ def _seed_key(rows: pd.DataFrame) -> pd.Series[int]:
 
 
 def _expected(
-    estimates: pd.DataFrame, truth: pd.DataFrame, judged: pd.DataFrame, methods: Sequence[str]
+    estimates: pd.DataFrame,
+    truth: pd.DataFrame,
+    judged: pd.DataFrame,
+    methods: Sequence[str],
+    ran: Mapping[str, Sequence[int]],
 ) -> pd.DataFrame:
     """Every tube with truth x method x seed, with the true pose in columns ``true_*``."""
     seeds = [
         (method, seed)
         for method in methods
-        for seed in sorted(set(judged.loc[judged["method"] == method, "seed_key"])) or [_NO_SEED]
+        for seed in sorted({*judged.loc[judged["method"] == method, "seed_key"], *ran.get(method, ())}) or [_NO_SEED]
     ]
     pairs = pd.DataFrame(seeds, columns=["method", "seed_key"])
     tubes = truth.loc[truth["status"] == "ok", [*_TRIAL, "slot", "tube", *_POSE]]

@@ -145,9 +145,10 @@ def squared_mahalanobis(
     """
     D = _relative(T_camera_estimate, T_camera_truth)
     error = np.column_stack([_swing_rad(D[:, :3, 2])[:, :2], D[:, :3, 3]])
-    known = np.isfinite(error).all(axis=1) & np.isfinite(covariance).all(axis=(1, 2))
+    known = np.flatnonzero(np.isfinite(error).all(axis=1) & np.isfinite(covariance).all(axis=(1, 2)))
+    known = known[np.linalg.eigvalsh(covariance[known])[:, 0] > 0]
     squares = np.full(len(error), np.nan)
-    if known.any():
+    if len(known):
         solved = np.linalg.solve(covariance[known], error[known][..., None])[..., 0]
         squares[known] = np.einsum("ni,ni->n", error[known], solved)
     return squares

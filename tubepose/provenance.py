@@ -28,7 +28,7 @@ PACKAGES = (
 
 @contextmanager
 def pinned_threads(count: int = 1) -> Iterator[None]:
-    """Bound the threads of BLAS, OpenCV and Open3D (0: no bound): one makes results the same in every run.
+    """Bound the threads of BLAS, OpenCV and Open3D: one makes results the same in every run.
 
     Open3D's warnings, which it prints to stdout, are held back meanwhile: what they tell is checked where it is used.
     """
@@ -37,7 +37,7 @@ def pinned_threads(count: int = 1) -> Iterator[None]:
     o3d.utility.set_max_threads(count)
     try:
         quiet = o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error)
-        with threadpool_limits(count or None), quiet:
+        with threadpool_limits(count), quiet:
             yield
     finally:
         cv2.setNumThreads(opencv_before)

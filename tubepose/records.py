@@ -57,7 +57,7 @@ TIMING_COLUMNS = (
     "duration_ms",
     "warmup",
 )
-_WHOLE = ("timestamp_ns", "seed")
+_WHOLE = ("timestamp_ns", "seed", "n_tubes_detected")
 
 
 def to_table(rows: Sequence[Row], columns: Sequence[str]) -> pd.DataFrame:

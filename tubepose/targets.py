@@ -96,6 +96,7 @@ def allowed_types(scene: Scene) -> NDArray[np.bool_] | None:
     T_camera_rack = scene.rack_pose.T_camera_rack
     named = {word: k for k, tube in enumerate(scene.tubes) for word in (tube.name, *tube.classes)}
     boxes = [box for box in scene.detections if box.class_name in named and np.isfinite(box.box_xyxy_px).all()]
+    boxes.sort(key=lambda box: -box.score)
     if not boxes or scene.intrinsics is None or T_camera_rack is None:
         return None
     may = np.ones((len(scene.tubes), len(scene.rack.all_slots)), bool)

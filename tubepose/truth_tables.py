@@ -128,37 +128,67 @@ def _errors(T_truth: FloatArray, T_measured: FloatArray, height_m: float) -> Row
     return {name: float(getattr(found, name)[0]) for name in FLOOR_COLUMNS[4:]}
 
 
-def exact_truth_rows(session: Session) -> list[Row]:
+def exact_truth_rows(session: Session, *, fail_fast: bool = True) -> tuple[list[Row], list[str]]:
     """The exact poses of a simulated session as rows of ground_truth.csv: every declared tube, none refused.
+
+    Returns:
+        The rows, and one line per trial whose exact truth is not there, or knows nothing of a declared tube.
 
     Raises:
         ConfigError: The session is recorded.
-        CaptureError: Its exact truth is not there, or knows nothing of a declared tube.
+        CaptureError: What would be a line, if `fail_fast`.
     """
-    if session.origin != "simulated":
-        raise ConfigError(f"session {session.name} is recorded: only simulated ones know exact poses")
-    rows = []
+    _refuse_recorded(session, "exact poses")
+    rows, problems = [], []
     for trial in session.trials:
-        exact = read_exact_truth(session.folder, trial.name)
-        keys: Row = {"session": session.name, "trial": trial.name, "capture": "", "status": "ok", "reason": "exact"}
-        for slot, name in trial.tubes.items():
-            if slot not in exact.tubes:
-                where = f"session {session.name}, trial {trial.name}"
-                raise CaptureError(f"{where}: a tube is declared in slot {slot}, but its exact truth has none there")
-            T_camera_tube = exact.tubes[slot][1]
-            rows.append({**keys, "slot": slot, "tube": session.tubes[name].name, **pose_columns(T_camera_tube)})
+        try:
+            rows += _exact_trial_rows(session, trial)
+        except TubePoseError as problem:
+            if fail_fast:
+                raise
+            problems.append(str(problem))
+    return rows, problems
+
+
+def _refuse_recorded(session: Session, what: str) -> None:
+    if session.origin != "simulated":
+        raise ConfigError(f"session {session.name} is recorded: only simulated ones know {what}")
+
+
+def _exact_trial_rows(session: Session, trial: Trial) -> list[Row]:
+    exact, rows = read_exact_truth(session.folder, trial.name), []
+    keys: Row = {"session": session.name, "trial": trial.name, "capture": "", "status": "ok", "reason": "exact"}
+    for slot, name in trial.tubes.items():
+        if slot not in exact.tubes:
+            where = f"session {session.name}, trial {trial.name}"
+            raise CaptureError(f"{where}: a tube is declared in slot {slot}, but its exact truth has none there")
+        T_camera_tube = exact.tubes[slot][1]
+        rows.append({**keys, "slot": slot, "tube": session.tubes[name].name, **pose_columns(T_camera_tube)})
     return rows
 
 
-def with_exact_rack(jobs: Sequence[Job], session: Session) -> list[Job]:
+def with_exact_rack(jobs: Sequence[Job], session: Session, *, fail_fast: bool = True) -> tuple[list[Job], list[str]]:
     """The jobs of a simulated session with the rack's exact pose, to tell the rack's error from the tubes'.
 
+    Returns:
+        The jobs, and one line per trial whose exact truth is not there.
+
     Raises:
-        ConfigError: The session is recorded, or its exact truth is not there.
+        ConfigError: The session is recorded.
+        CaptureError: What would be a line, if `fail_fast`.
     """
-    if session.origin != "simulated":
-        raise ConfigError(f"session {session.name} is recorded: only simulated ones know the rack's exact pose")
-    return [replace(job, T_camera_rack=read_exact_truth(session.folder, job.trial).T_camera_rack) for job in jobs]
+    _refuse_recorded(session, "the rack's exact pose")
+    found, problems = [], []
+    for job in jobs:
+        try:
+            exact = read_exact_truth(session.folder, job.trial)
+        except TubePoseError as problem:
+            if fail_fast:
+                raise
+            problems.append(str(problem))
+            continue
+        found.append(replace(job, T_camera_rack=exact.T_camera_rack))
+    return found, problems
 
 
 def floor_note(floor: pd.DataFrame) -> str:

@@ -25,7 +25,7 @@ def uncertainty(errors: pd.DataFrame) -> pd.DataFrame:
     """How honest the stated covariances are, per method that states them and per tube.
 
     Args:
-        errors: Rows of errors.csv; only those that are ``ok`` count.
+        errors: Rows of errors.csv; only those count that are ``ok`` and state a covariance.
 
     Returns:
         Rows of uncertainty.csv: share of the truths inside the 95 % region of the five stated errors, mean of their
@@ -35,7 +35,8 @@ def uncertainty(errors: pd.DataFrame) -> pd.DataFrame:
     rows: list[dict[str, Any]] = []
     limit = float(chi2.ppf(REGION, len(COVARIANCE_AXES)))
     for method, tube, group in _groups(errors):
-        squares = group["mahalanobis2"].dropna()
+        group = group[group["mahalanobis2"].notna()]
+        squares = group["mahalanobis2"]
         if len(squares) == 0:
             continue
         ordered = group.sort_values("score", ascending=False, kind="stable")["tilt_deg"]
@@ -59,7 +60,7 @@ def coverage(errors: pd.DataFrame) -> pd.DataFrame:
     """Mean tilt error of the answers that are kept when the lowest scores are dropped.
 
     Args:
-        errors: Rows of errors.csv; only those that are ``ok`` count.
+        errors: Rows of errors.csv; only those count that are ``ok`` and have a score.
 
     Returns:
         Rows of coverage.csv, per method, tube (and ``all``) and share kept, the nearest share that the scores allow.

@@ -11,7 +11,7 @@ from typing import Literal
 from pydantic import BaseModel, ConfigDict, Field
 
 from tubepose.errors import CaptureError, LabwareError
-from tubepose.labware import CapModel, RackModel, TubeModel, load_cap, load_rack, load_tube
+from tubepose.labware import CapModel, RackModel, TubeModel, load_cap, load_rack, load_tube, unique_tubes
 from tubepose.labware.reading import read_yaml, validate
 
 SESSION_FILE = "session.yaml"
@@ -82,7 +82,12 @@ class Session(BaseModel):
 
     def tubes_of(self, trial: Trial) -> tuple[TubeModel, ...]:
         """The kinds of tube in a trial, each once, in a fixed order."""
-        return tuple(self.tubes[name] for name in sorted(set(trial.tubes.values())))
+        return tuple(dict.fromkeys(self.tubes[name] for name in sorted(set(trial.tubes.values()))))
+
+    @property
+    def types(self) -> dict[str, TubeModel]:
+        """Every tube model that the trials name, by its own name, as tables have it."""
+        return {tube.name: tube for tube in self.tubes.values()}
 
 
 def is_session(path: Path) -> bool:
@@ -106,6 +111,7 @@ def load_session(path: Path) -> Session:
         rack = load_rack(data.rack, folder)
         cap = load_cap(data.printed_cap, folder) if data.printed_cap is not None else None
         tubes = {name: load_tube(name, folder) for trial in data.trials for name in trial.tubes.values()}
+        unique_tubes(tubes.values(), "the trials")
     except LabwareError as problem:
         raise LabwareError(f"{file}: {problem}") from None
     _check_trials(file, data, rack)

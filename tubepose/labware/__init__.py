@@ -1,7 +1,7 @@
 """Racks, tubes and printed caps: definitions in YAML, a built-in catalogue, and the geometry that follows from them."""
 
 from tubepose.labware.racks import RackModel, SlotGrid, SlotModel, SlotShape
-from tubepose.labware.reading import Labware, catalogue, load_cap, load_rack, load_tube, read_labware
+from tubepose.labware.reading import Labware, catalogue, load_cap, load_rack, load_tube, read_labware, unique_tubes
 from tubepose.labware.tubes import CapModel, TubeModel, WallOptics
 
 __all__ = [
@@ -18,4 +18,5 @@ __all__ = [
     "load_rack",
     "load_tube",
     "read_labware",
+    "unique_tubes",
 ]

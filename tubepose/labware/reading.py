@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import difflib
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from functools import cache
 from importlib.resources import files
 from pathlib import Path
@@ -130,6 +130,19 @@ def load_rack(name_or_file: str, folder: Path | None = None) -> RackModel:
 def load_tube(name_or_file: str, folder: Path | None = None) -> TubeModel:
     """A tube by catalogue name or by YAML file (relative to `folder` if given)."""
     return _load(name_or_file, TubeModel, "tube", folder)
+
+
+def unique_tubes(tubes: Iterable[TubeModel], where: str) -> tuple[TubeModel, ...]:
+    """The tubes, each once: two names or files can mean the same one.
+
+    Raises:
+        LabwareError: Two of them differ and have the same name, which no table could tell apart.
+    """
+    found: dict[str, TubeModel] = {}
+    for tube in tubes:
+        if found.setdefault(tube.name, tube) != tube:
+            raise LabwareError(f"{where}: two different tubes are named '{tube.name}'; give one of them another name")
+    return tuple(found.values())
 
 
 def load_cap(name_or_file: str, folder: Path | None = None) -> CapModel:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 import os
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import asdict, is_dataclass
 from pathlib import Path
@@ -31,6 +31,21 @@ def make_folder(path: Path) -> None:
         raise ConfigError(
             f"{path}: cannot be a folder for results ({problem.strerror}); choose another place"
         ) from None
+
+
+def remove_files(folder: Path, names: Iterable[str]) -> None:
+    """Remove results of an earlier run that this one has none of: they would lie beside results they do not belong to.
+
+    Raises:
+        ConfigError: One of them cannot be removed.
+    """
+    for name in names:
+        try:
+            (folder / name).unlink(missing_ok=True)
+        except OSError as problem:
+            raise ConfigError(
+                f"{folder / name}: of an earlier run, and cannot be removed ({problem.strerror}); choose another folder"
+            ) from None
 
 
 @contextmanager
