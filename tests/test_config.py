@@ -63,3 +63,25 @@ def test_missing_file(tmp_path):
 def test_a_section_cannot_be_changed_in_place():
     with pytest.raises(ValidationError, match="frozen"):
         Config().tube.min_points = 1
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("profile: {score_tilt_rad: 0}", "score_tilt_rad: expected more than 0, found 0"),
+        ("rack: {min_seen: .nan}", "min_seen: .*finite"),
+        ("rack: {max_inlier_rmse_m: -1}", "max_inlier_rmse_m: expected 0 or more, found -1"),
+        ("rack: {icp_distances_m: []}", "icp_distances_m: expected one or more numbers, found none"),
+        ("rack_top: {seed: -1}", "seed: expected 0 or more, found -1"),
+        ("profile: {plane_points: 0}", "plane_points: expected more than 0"),
+    ],
+)
+def test_numbers_that_would_open_a_gate_or_break_a_fit_are_refused(tmp_path, text, words):
+    (tmp_path / "a.yaml").write_text(text, encoding="utf-8")
+    with pytest.raises(ConfigError, match=words):
+        load_config(tmp_path / "a.yaml")
+
+
+def test_a_limit_of_zero_switches_its_gate_off(tmp_path):
+    (tmp_path / "a.yaml").write_text("rack: {min_seen: 0}", encoding="utf-8")
+    assert load_config(tmp_path / "a.yaml").rack.min_seen == 0

@@ -428,3 +428,54 @@ def test_no_length_is_infinite(tmp_path, value):
     (tmp_path / "t.yaml").write_text(text)
     with pytest.raises(LabwareError, match="finite number"):
         read_labware(tmp_path / "t.yaml")
+
+
+# Measures and names that no labware has
+
+
+@pytest.mark.parametrize(
+    ("name", "changes", "words"),
+    [
+        ("chen2023-soft-5x10", {"name": "../../x"}, "files and rows are named by it, so it cannot hold '/'"),
+        ("chen2023-soft-5x10", {"name": "a\nb"}, r"cannot hold '\\n'"),
+        ("chen2023-soft-5x10", {"name": ".hidden"}, "a dot at the start"),
+        ("chen2023-soft-5x10", {"name": "x" * 81}, "at most 80 characters"),
+        ("chen2023-soft-5x10", {"name": "unknown"}, "is a word of the tables"),
+        ("chen2023-soft-5x10", {"outline_mm": [0.2, 0.1]}, "a rack is 10 mm or more each way, .*: are they metres"),
+        ("chen2023-soft-5x10", {"floor_play_mm": 100}, "more than half of the widest slot"),
+        ("chen2023-soft-5x10", {"height_mm": True}, "height_mm: expected no yes or no"),
+        ("chen2023-soft-5x10", {"outline_mm": [True, 90]}, "outline_mm: expected no yes or no"),
+        ("chen2023-tube-2", {"classes": ["rack"]}, "'rack' is a detector's word for racks"),
+        ("chen2023-tube-2", {"name": "all"}, "is a word of the tables"),
+        ("chen2023-tube-2", {"classes": "red-cap"}, r"classes: expected a list in brackets"),
+    ],
+)
+def test_what_no_labware_has_is_refused(tmp_path, name, changes, words):
+    data = catalogue()[name].model_dump(mode="json", exclude_none=True) | changes
+    (tmp_path / "a.yaml").write_text(yaml.safe_dump(data), encoding="utf-8")
+    with pytest.raises(LabwareError, match=words):
+        read_labware(tmp_path / "a.yaml")
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("kind: rack\nheight_mm: 60\nheight_mm: 10\n", "the key 'height_mm' is there twice"),
+        ("kind: rack\ngrid: {rows: 2, rows: 3}\n", "the key 'rows' is there twice"),
+        ("kind: rack\nsource: 2024-13-45\n", "not valid YAML: month must be in 1..12"),
+        ("kind: " + "[" * 2000, "not valid YAML"),
+        ("? [a, b]\n: 1\n", "not valid YAML: while constructing a mapping"),
+    ],
+)
+def test_yaml_that_loses_a_value_or_is_none_is_one_line(tmp_path, text, words):
+    (tmp_path / "a.yaml").write_text(text, encoding="utf-8")
+    with pytest.raises(LabwareError, match=words):
+        read_labware(tmp_path / "a.yaml")
+
+
+def test_a_cap_that_floats_and_a_round_slot_with_corners_are_refused():
+    cap = catalogue()["chen2023-tube-2"].cap.model_dump()
+    with pytest.raises(ValueError, match="the cap floats over the rim"):
+        TubeCap(**cap | {"top_mm": cap["height_mm"] + 1})
+    with pytest.raises(ValueError, match="corner_radius_mm is of square openings"):
+        SlotModel(name="A1", center_mm=(0, 0), shape="round", size_mm=(16, 16), corner_radius_mm=4)

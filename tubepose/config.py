@@ -7,9 +7,9 @@ No default was fitted to a capture that a table of ours is computed on; docs/met
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Literal
+from typing import Literal, Self
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from tubepose.errors import ConfigError
 from tubepose.labware.reading import read_yaml, validate
@@ -19,7 +19,23 @@ RackMethod = Literal["edges", "obb-icp"]
 
 
 class _Section(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True)
+    """Strict about keys and numbers: a gate of NaN would be open, and nothing here means anything below zero."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+    @model_validator(mode="after")
+    def _check_numbers(self) -> Self:
+        for name, value in self:
+            numbers = value if isinstance(value, tuple) else (value,)
+            if not numbers:
+                raise ValueError(f"{name}: expected one or more numbers, found none")
+            may_be_zero = name == "seed" or name.startswith(("min_", "max_"))  # limits: 0 switches a gate off
+            for number in numbers:
+                if isinstance(number, bool | str | BaseModel) or number > 0 or (number == 0 and may_be_zero):
+                    continue
+                expected = "0 or more" if may_be_zero else "more than 0"
+                raise ValueError(f"{name}: expected {expected}, found {number}")
+        return self
 
 
 class PreprocessConfig(_Section):

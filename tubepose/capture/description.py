@@ -17,7 +17,7 @@ IMAGE_FILES = ("image.png", "image.jpg", "image.jpeg")
 
 Unit = Literal["m", "mm"]
 _Row = tuple[float, float, float, float]
-_FORBID = ConfigDict(extra="forbid", frozen=True)
+_FORBID = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 # Counts coarser than this are a scale given in the wrong unit.
 _MAX_DEPTH_SCALE_M = 0.01
 
@@ -70,7 +70,7 @@ class CaptureFile(BaseModel):
     intrinsics: IntrinsicsEntry | None = None
     cloud_intrinsics: IntrinsicsEntry | None = None
     T_image_cloud: tuple[_Row, _Row, _Row, _Row] | None = None
-    timestamp_ns: StrictInt | None = None
+    timestamp_ns: Annotated[StrictInt, Field(ge=0, lt=2**63)] | None = None
     sensor: str = "unknown"
     simulated: StrictBool = False
 

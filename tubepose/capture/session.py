@@ -25,7 +25,7 @@ class SlotHint(BaseModel):
         pixel: Its place (u, v) in the image; a click is exact enough.
     """
 
-    model_config = ConfigDict(extra="forbid", frozen=True)
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
     slot: str
     pixel: tuple[float, float]
 
@@ -41,7 +41,7 @@ class Trial(BaseModel):
         hint: Which way round the rack stands, if that was noted.
     """
 
-    model_config = ConfigDict(extra="forbid", frozen=True)
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
     name: str = Field(min_length=1)
     tubes: dict[str, str]
     original: str
@@ -50,7 +50,7 @@ class Trial(BaseModel):
 
 
 class _SessionFile(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True)
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
     format: Literal[1]
     name: str = Field(min_length=1)
     origin: Literal["recorded", "simulated"]
@@ -70,7 +70,7 @@ class Session(BaseModel):
         tubes: Every tube model that the trials name, by the name that they use.
     """
 
-    model_config = ConfigDict(extra="forbid", frozen=True)
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
     folder: Path
     name: str
     origin: Literal["recorded", "simulated"]

@@ -12,17 +12,45 @@ from __future__ import annotations
 from functools import cached_property
 from typing import Annotated, Any, Self
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationInfo, field_validator
 
 MM = 1e-3
 Positive = Annotated[float, Field(gt=0)]
 NonNegative = Annotated[float, Field(ge=0)]
+
+LONGEST_NAME = 80
+RESERVED_NAMES = frozenset({"all", "none", "unknown"})
+"""What tables call all types, no type, and one that is not known."""
+
+
+def _name(text: str) -> str:
+    """A name that files and rows can have."""
+    if text in RESERVED_NAMES:
+        raise ValueError(f"'{text}' is a word of the tables; choose another name")
+    odd = sorted({c for c in text if c in "/\\" or not c.isprintable()})
+    if odd or text.startswith(".") or text != text.strip():
+        what = ", ".join(map(repr, odd)) or ("a dot at the start" if text.startswith(".") else "a blank at an end")
+        raise ValueError(f"files and rows are named by it, so it cannot hold {what} (found {text!r})")
+    return text
+
+
+Name = Annotated[str, Field(min_length=1, max_length=LONGEST_NAME), AfterValidator(_name)]
 
 
 class Definition(BaseModel):
     """Base of every definition and of its parts: frozen, and strict about unknown keys."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, ignored_types=(cached_property,), allow_inf_nan=False)
+
+    @field_validator("*", mode="before")
+    @classmethod
+    def _no_words_as_numbers(cls, value: Any, info: ValidationInfo) -> Any:
+        """YAML reads `yes` and `on` as true, which would count as 1."""
+        field = cls.model_fields[info.field_name or ""]
+        parts = value if isinstance(value, list) else [value]
+        if field.annotation is not bool and any(isinstance(part, bool) for part in parts):
+            raise ValueError(f"expected no yes or no (found {value!r})")
+        return value
 
     def __eq__(self, other: object) -> bool:
         """Whether both define the same; what was computed of one of them, and kept, does not count."""

@@ -12,9 +12,10 @@ from typing import Annotated, Literal
 import numpy as np
 from pydantic import Field, model_validator
 
-from tubepose.labware.definition import MM, Definition, NonNegative, Positive
+from tubepose.labware.definition import MM, Definition, Name, NonNegative, Positive
 from tubepose.transforms import FloatArray
 
+LEAST_RACK_MM = 10.0
 Shape = Literal["square", "round"]
 
 
@@ -29,7 +30,7 @@ class SlotModel(Definition):
         corner_radius_mm: Rounding of a square slot's corners.
     """
 
-    name: str = Field(min_length=1)
+    name: Name
     center_mm: tuple[float, float]
     shape: Shape
     size_mm: tuple[Positive, Positive]
@@ -39,6 +40,8 @@ class SlotModel(Definition):
     def _check(self) -> SlotModel:
         if self.shape == "round" and self.size_mm[0] != self.size_mm[1]:
             raise ValueError(f"slot {self.name}: a round slot has one diameter, found {self.size_mm}")
+        if self.shape == "round" and self.corner_radius_mm:
+            raise ValueError(f"slot {self.name}: corner_radius_mm is of square openings, and this one is round")
         if 2 * self.corner_radius_mm > min(self.size_mm):
             raise ValueError(f"slot {self.name}: corner_radius_mm is more than half the opening")
         return self
@@ -135,7 +138,7 @@ class RackModel(Definition):
     """
 
     kind: Literal["rack"]
-    name: str = Field(min_length=1)
+    name: Name
     description: str = ""
     source: str = ""
     outline_mm: tuple[Positive, Positive]
@@ -150,12 +153,18 @@ class RackModel(Definition):
     def _check(self) -> RackModel:
         if (self.grid is None) == (not self.slots):
             raise ValueError("a rack needs either 'grid' or 'slots', and not both")
+        if min(*self.outline_mm, self.height_mm) < LEAST_RACK_MM:
+            measures = f"outline_mm {self.outline_mm}, height_mm {self.height_mm}"
+            raise ValueError(f"a rack is {LEAST_RACK_MM:g} mm or more each way, found {measures}: are they metres?")
         if self.floor_mm >= self.height_mm:
             raise ValueError(f"floor_mm {self.floor_mm} is not below height_mm {self.height_mm}")
         names = [slot.name for slot in self.all_slots]
         doubled = sorted({name for name in names if names.count(name) > 1})
         if doubled:
             raise ValueError(f"slot names must be unique, found twice: {', '.join(doubled)}")
+        widest = max(max(slot.size_mm) for slot in self.all_slots)
+        if self.floor_play_mm > widest / 2:
+            raise ValueError(f"floor_play_mm {self.floor_play_mm} is more than half of the widest slot, {widest:g} mm")
         half = np.array(self.outline_mm) / 2
         for slot in self.all_slots:
             if np.any(np.abs(slot.center_mm) + np.array(slot.size_mm) / 2 >= half):

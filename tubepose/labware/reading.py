@@ -22,15 +22,30 @@ _M = TypeVar("_M", bound=BaseModel)
 _L = TypeVar("_L", RackModel, TubeModel, CapModel)
 
 
+class _Loader(yaml.SafeLoader):
+    """Of two values for one key YAML keeps the last one, and so loses what was meant: refused instead."""
+
+    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
+        seen: set[str] = set()
+        for key, _ in node.value:
+            if not isinstance(key, yaml.ScalarNode):
+                continue
+            if key.value in seen:
+                told = f"the key '{key.value}' is there twice"
+                raise yaml.constructor.ConstructorError(None, None, told, key.start_mark)
+            seen.add(key.value)
+        return super().construct_mapping(node, deep)
+
+
 def read_yaml(path: Path, error: type[TubePoseError]) -> dict[str, Any]:
     """Read one YAML mapping; raises `error` in one line if the file is missing, broken or no mapping."""
     try:
-        data = yaml.safe_load(path.read_text(encoding="utf-8"))
+        data = yaml.load(path.read_text(encoding="utf-8"), _Loader)  # a SafeLoader
     except FileNotFoundError:
         raise error(f"{path}: no such file") from None
     except (OSError, UnicodeDecodeError) as problem:
         raise error(f"{path}: cannot be read: {problem}") from None
-    except yaml.YAMLError as problem:
+    except (yaml.YAMLError, ValueError, OverflowError, RecursionError) as problem:  # dates and depths that are none
         raise error(f"{path}: not valid YAML: {problem}") from None
     if not isinstance(data, dict):
         found = "nothing: the file is empty" if data is None else f"a {type(data).__name__}"
@@ -56,7 +71,7 @@ def _explain(model: type[BaseModel], entry: Any) -> str:
     if entry["type"] == "missing":
         return f"the key '{place}' is missing"
     if entry["type"] == "tuple_type":
-        return f"{place}: expected a list, for example [16.5, 16.5] (found {entry['input']!r})"
+        return f"{place}: expected a list in brackets, [..., ...] (found {entry['input']!r})"
     message = entry["msg"].removeprefix("Value error, ")
     message = f"{place}: {message}" if place else message
     given = entry["input"]

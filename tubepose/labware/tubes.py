@@ -12,9 +12,11 @@ from typing import Literal
 import numpy as np
 from pydantic import Field, model_validator
 
-from tubepose.labware.definition import MM, Definition, NonNegative, Positive
+from tubepose.labware.definition import MM, Definition, Name, NonNegative, Positive
 from tubepose.transforms import FloatArray
 
+LEAST_TUBE_MM = 5.0
+RACK_CLASS = "rack"
 Material = Literal["opaque", "translucent", "transparent"]
 
 
@@ -106,6 +108,10 @@ class TubeCap(Definition):
 
     @model_validator(mode="after")
     def _check(self) -> TubeCap:
+        if self.top_mm > self.height_mm:
+            raise ValueError(
+                f"top_mm {self.top_mm} is more than height_mm {self.height_mm}: the cap floats over the rim"
+            )
         if self.open and self.top_mm > 0:
             raise ValueError("an open flange ends with the rim: top_mm must be 0")
         return self
@@ -123,7 +129,7 @@ class TubeModel(Definition):
     """
 
     kind: Literal["tube"]
-    name: str = Field(min_length=1)
+    name: Name
     description: str = ""
     source: str = ""
     classes: tuple[str, ...] = ()
@@ -132,6 +138,11 @@ class TubeModel(Definition):
 
     @model_validator(mode="after")
     def _check(self) -> TubeModel:
+        if RACK_CLASS in self.classes:
+            raise ValueError(f"classes: '{RACK_CLASS}' is a detector's word for racks; give words for this tube")
+        if self.body.height_mm < LEAST_TUBE_MM:
+            high = self.body.height_mm
+            raise ValueError(f"a tube is {LEAST_TUBE_MM:g} mm high or more, found height_mm {high}: is it in metres?")
         if self.cap is not None:
             if self.cap.height_mm >= self.height_mm - self.body.bottom_height_mm:
                 raise ValueError("the cap reaches below the body's wall")
@@ -238,7 +249,7 @@ class CapModel(Definition):
     """
 
     kind: Literal["cap"]
-    name: str = Field(min_length=1)
+    name: Name
     description: str = ""
     source: str = ""
     square_mm: Positive
