@@ -77,6 +77,8 @@ def bench(
     jobs: list[Job] = []
     folders, problems = find_sessions(sessions or [sample_session()], fail_fast=fail_fast)
     measured = measure_sessions(folders, out, exact=exact_truth, fail_fast=fail_fast)
+    if not measured.sessions:
+        finish([*problems, *measured.problems])  # before anything of an earlier run is written over
     for session in measured.sessions:
         try:
             found, unread = session_jobs(session, fail_fast=fail_fast)

@@ -105,6 +105,8 @@ def estimate(
             if fail_fast:
                 raise
             problems.append(str(problem))
+    if not jobs:
+        finish(problems)  # before anything of an earlier run is written over
     tables = run_estimates(
         jobs, methods, detector_for, settings, out, sys.argv, seeds=seeds, overlays=overlays, fail_fast=fail_fast,
         inputs=[
@@ -133,8 +135,9 @@ def estimate(
             )
             rack_words = f"{row['status']}: {row['reason']}{others}"
         keys = ("session", "trial", "capture", "frame", "method")
-        tubes_words = describe_tubes([e for e in tables.estimates if all(e[key] == row[key] for key in keys)])
-        say(f"{row['capture']} frame {row['frame']}: rack {row['rack']} {rack_words}; {tubes_words}")
+        of = [e for e in tables.estimates if all(e[key] == row[key] for key in keys) and not e["seed"]]  # none, or 0
+        by = f"{row['method']}: " if len(methods) > 1 else ""
+        say(f"{row['capture']} frame {row['frame']}: rack {row['rack']} {rack_words}; {by}{describe_tubes(of)}")
     if tubes is None and any(not job.tubes for job in jobs):
         say("no --tubes given: only the rack and its slots are estimated")
     finish([*problems, *tables.problems])

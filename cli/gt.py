@@ -29,6 +29,8 @@ def gt(
     folders, problems = find_sessions(sessions, fail_fast=fail_fast)
     measured = measure_sessions(folders, out, fail_fast=fail_fast)
     problems += measured.problems
+    if not measured.sessions:
+        finish(problems)
     caps = [session.printed_cap for session in measured.sessions if session.printed_cap is not None]
     labware = [item for session in measured.sessions for item in (session.rack, *session.tubes.values())]
     record = run_record(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -34,9 +35,13 @@ def sample_session() -> Path:
 
 def read_tubes(names: str) -> tuple[TubeModel, ...]:
     """Tube models of a comma-separated list of names and files."""
+    from tubepose.errors import ConfigError
     from tubepose.labware import load_tube, unique_tubes
 
-    return unique_tubes([load_tube(name.strip()) for name in names.split(",") if name.strip()], "--tubes")
+    tubes = [name.strip() for name in names.split(",") if name.strip()]
+    if not tubes:
+        raise ConfigError(f"--tubes '{names}' names no tube; see 'tubepose labware list'")
+    return unique_tubes([load_tube(name) for name in tubes], "--tubes")
 
 
 def read_methods(names: str) -> tuple[str, ...]:
@@ -129,16 +134,20 @@ def capture_jobs(
     if not path.exists():
         raise CaptureError(f"{path}: no such file or folder")
     topic = {f"{kind}_topic": name for kind, name in (topics or {}).items()}
+    opened = open_captures(path, unit=unit, **topic)
+    idle = [f"--{kind}-topic" for kind, name in (topics or {}).items() if name is not None]
+    if idle and not any(capture.path.suffix.lower() == ".mcap" for capture in opened):
+        raise ConfigError(f"{path}: {', '.join(idle)} given, but no .mcap file is there that has topics; leave it out")
     told = read_hint(hint, choice.rack) if hint is not None else None
     if choice.rack is not None:
-        return [Job(capture, choice.rack, tubes, told) for capture in open_captures(path, unit=unit, **topic)], []
+        return [Job(capture, choice.rack, tubes, told) for capture in opened], []
     if not choice.open:
         raise ConfigError(
             f"{path}: not a session, so the rack must be named: --rack NAME|FILE|auto|grid "
             "(see 'tubepose labware list')"
         )
     find = rack_finder(choice, config)
-    return [UnnamedJob(capture, find, tubes, told) for capture in open_captures(path, unit=unit, **topic)], []
+    return [UnnamedJob(capture, find, tubes, told) for capture in opened], []
 
 
 def read_hint(text: str, rack: RackModel | None) -> SlotHint:
@@ -149,6 +158,8 @@ def read_hint(text: str, rack: RackModel | None) -> SlotHint:
     slot, _, pixel = text.partition("@")
     try:
         u, v = (float(value) for value in pixel.split(","))
+        if not math.isfinite(u + v):
+            raise ValueError(pixel)
     except ValueError:
         raise ConfigError(f"--hint {text}: expected SLOT@U,V, for example A1@412,300") from None
     if rack is not None and slot not in {known.name for known in rack.all_slots}:

@@ -14,6 +14,10 @@ if TYPE_CHECKING:
     from tubepose.rack.lattice import SlotLattice
 
 
+SIDES_MM = (2.0, 200.0)
+"""Least and largest pitch or opening that ``--rack grid`` takes: another number is of another unit."""
+
+
 @dataclass(frozen=True)
 class RackChoice:
     """What `--rack` says: a rack, or how to find one out for each capture.
@@ -75,8 +79,11 @@ def _sides(option: str, text: str) -> tuple[float, float]:
         sides = [float(side) for side in text.split("x")]
     except ValueError:
         sides = []
-    if len(sides) not in (1, 2) or min(sides) <= 0:
-        raise ConfigError(f"{option} {text}: expected millimetres as X or XxY, for example 18.5x17.7")
+    low, high = SIDES_MM
+    if len(sides) not in (1, 2) or not all(low <= side <= high for side in sides):
+        raise ConfigError(
+            f"{option} {text}: expected millimetres from {low:g} to {high:g} as X or XxY, for example 18.5x17.7"
+        )
     return sides[0], sides[-1]
 
 

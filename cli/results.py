@@ -13,6 +13,10 @@ if TYPE_CHECKING:
     from tubepose.pipeline import Scene, TubeEstimate
 
 
+LONGEST_NAME = 200
+"""Bytes of an overlay's name before its numbers; a file system takes 255."""
+
+
 def run_estimates(
     jobs: Sequence[Job | UnnamedJob],
     methods: Sequence[str],
@@ -40,9 +44,11 @@ def run_estimates(
     from tubepose.report.writing import make_folder, write_csv, write_json
     from tubepose_cli.show import progress
 
+    taken: dict[str, tuple[str, ...]] = {}
+
     def draw(job: Job, scene: Scene, estimates: tuple[TubeEstimate, ...]) -> None:
         if overlays:
-            write_overlay(out / "overlays", job, scene, estimates)
+            write_overlay(out / "overlays" / overlay_name(job, scene, taken), scene, estimates)
 
     make_folder(out)
     with pinned_threads(1), progress("captures", len(jobs)) as step:
@@ -69,15 +75,26 @@ def run_estimates(
     return tables
 
 
-def write_overlay(folder: Path, job: Job, scene: Scene, estimates: Sequence[TubeEstimate]) -> None:
-    """One overlay picture, named by capture and frame."""
+def overlay_name(job: Job, scene: Scene, taken: dict[str, tuple[str, ...]]) -> str:
+    """A file name by capture and frame, not too long; `taken` tells captures apart whose names come out the same."""
+    capture = scene.frame.capture
+    trial = "" if job.trial in capture else job.trial  # trials may call their captures by the same name
+    parts = "-".join(part for part in (job.session, trial, capture) if part)
+    plain = "".join(c if c.isprintable() and c != "/" else "_" for c in parts)
+    plain = plain.encode()[:LONGEST_NAME].decode(errors="ignore")
+    name, key, number = plain, (job.session, job.trial, capture), 1
+    while taken.setdefault(name, key) != key:
+        number += 1
+        name = f"{plain}-{number}"
+    return f"{name}-{scene.frame.index:04d}.png"
+
+
+def write_overlay(path: Path, scene: Scene, estimates: Sequence[TubeEstimate]) -> None:
+    """One overlay picture."""
     import cv2
 
     from tubepose.report.overlay import draw_overlay
     from tubepose.report.writing import write_bytes
 
-    capture = scene.frame.capture
-    trial = "" if job.trial in capture else job.trial  # trials may call their captures by the same name
-    name = "-".join(part for part in (job.session, trial, capture) if part).replace("/", "_")
     _, png = cv2.imencode(".png", draw_overlay(scene, estimates))
-    write_bytes(folder / f"{name}-{scene.frame.index:04d}.png", png.tobytes())
+    write_bytes(path, png.tobytes())

@@ -70,8 +70,10 @@ def _duration(seconds: float) -> str:
 
 
 def say(text: str) -> None:
-    """Talk: one line on stderr."""
-    typer.echo(text, err=True)
+    """Talk: one line on stderr, whatever names it quotes."""
+    from tubepose.errors import one_line
+
+    typer.echo(one_line(text), err=True)
 
 
 def show_table(table: pd.DataFrame, title: str, notes: Sequence[str] = ()) -> None:

@@ -51,8 +51,6 @@ def simulate(
     if sensor not in SENSORS:
         raise ConfigError(unknown_name("sensor", sensor, SENSORS))
     models = read_tubes(tubes)
-    if not models:
-        raise ConfigError("--tubes names no tube; see 'tubepose labware list'")
     variation = _variation(scenes, fill, scattering, liquid, labels, perfect_parts)
     total = 2 * trials * (1 if mixed else len(models))
     rack_model, cap_model = load_rack(rack), load_cap(cap)

@@ -41,7 +41,7 @@ class MeasuredTruth:
 def measure_sessions(
     folders: Sequence[Path], out: Path, *, exact: bool = False, fail_fast: bool = False
 ) -> MeasuredTruth:
-    """Measure all sessions, or take the exact poses of simulated ones, and write ground_truth.csv into `out`.
+    """Measure all sessions, or take the exact poses of simulated ones, and write ground_truth.csv into `out`, if any.
 
     ground_truth_floor.csv is written too if one that was measured is simulated.
     """
@@ -79,9 +79,12 @@ def measure_sessions(
             if fail_fast:
                 raise
             problems.append(str(problem))
-    make_folder(out)
     config = GroundTruthConfig()
     tables = TruthTables()
+    if not sessions:
+        nothing = to_table([], TRUTH_COLUMNS), to_table([], FLOOR_COLUMNS)
+        return MeasuredTruth((), *nothing, (), tuple(problems), asdict(config))
+    make_folder(out)
     with pinned_threads(1), progress("ground truth", sum(len(s.trials) for s in sessions)) as step:
         for session in sessions:
             if not exact:

@@ -423,3 +423,31 @@ def test_nothing_to_open_is_said(tmp_path):
         open_captures(tmp_path / "scan.xyz")
     with pytest.raises(CaptureError, match="unit 'cm' is not known; expected m or mm"):
         open_captures(tmp_path, unit="cm")
+
+
+def write_depth_capture(folder: Path, **keys) -> None:
+    describe(folder, **({"unit": "mm", "intrinsics": camera_keys()} | keys))
+    cv2.imwrite(str(folder / "depth.png"), np.full((24, 32), 700, np.uint16))
+
+
+def test_a_link_in_a_circle_leads_nowhere_new(tmp_path):
+    write_depth_capture(tmp_path / "in" / "one")
+    (tmp_path / "in" / "loop").symlink_to(tmp_path / "in")
+    (tmp_path / "in" / "again").symlink_to(tmp_path / "in" / "one")
+    assert [capture.name for capture in open_captures(tmp_path / "in")] == ["again", "one"]
+
+
+def test_a_unit_that_is_typed_goes_before_the_files_for_depth_too(tmp_path):
+    write_depth_capture(tmp_path / "one")
+    frame = read_one(tmp_path / "one")
+    write_depth_capture(tmp_path / "one", unit="m")
+    with pytest.raises(CaptureError, match="16-bit counts cannot be whole metres"):
+        read_one(tmp_path / "one")
+    np.testing.assert_array_equal(read_one(tmp_path / "one", unit="mm").cloud_m, frame.cloud_m)
+
+
+@pytest.mark.parametrize("stamp", [-5, 10**25])
+def test_a_stamp_that_is_none_is_one_line(tmp_path, stamp):
+    write_depth_capture(tmp_path / "one", timestamp_ns=stamp)
+    with pytest.raises(CaptureError, match="timestamp_ns"):
+        read_one(tmp_path / "one")

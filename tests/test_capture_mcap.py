@@ -597,8 +597,9 @@ def test_damaged_chunk_is_noticed(tmp_path):
         read_all(path)
 
 
-def test_other_content_is_no_mcap(tmp_path):
-    (tmp_path / "a.mcap").write_bytes(b"not a recording at all")
+@pytest.mark.parametrize("content", [b"not a recording at all", b"short"])
+def test_other_content_is_no_mcap(tmp_path, content):
+    (tmp_path / "a.mcap").write_bytes(content)
     with pytest.raises(CaptureError, match="expected an MCAP file, found other content"):
         read_all(tmp_path / "a.mcap")
 

@@ -446,7 +446,7 @@ def test_a_wrong_option_is_one_line(
             "unknown sensor 'raycst'; did you mean 'raycast'?; known: raycast, structured-light",
         ),
         (("out", "--cap", "printed-square"), "unknown cap 'printed-square'; did you mean 'printed-square-16.7'?"),
-        (("out", "--tubes", ","), "--tubes names no tube; see 'tubepose labware list'"),
+        (("out", "--tubes", ","), "--tubes ',' names no tube; see 'tubepose labware list'"),
         (("out", "--tubes", "centrifuge-50ml-conical"), "cannot stand in rack 'round-10ml-3x4'"),
         (
             ("out", "--fill", "1.5"),
@@ -841,3 +841,53 @@ def test_detection_runs_on_one_thread_as_the_tables_say() -> None:
     detector = make_detector("yolo", None, None, None, None, Config())(load_rack(SMALL_RACK), ())
     options = detector.yolo._session.runtime.get_session_options()
     assert options.intra_op_num_threads == 1
+
+
+# What a typing mistake does
+
+
+@pytest.mark.parametrize("command", ["estimate", "bench", "gt"])
+def test_a_path_that_is_not_there_writes_over_nothing(command: str, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    out.mkdir()
+    (out / "racks.csv").write_text("kept", encoding="utf-8")
+    one_error(tubepose(command, tmp_path / "nowhere", "--out", out), f"{tmp_path / 'nowhere'}: no such file")
+    assert [path.name for path in out.iterdir()] == ["racks.csv"]
+    assert tubepose(command, tmp_path / "nowhere", "--out", tmp_path / "new").code == 1
+    assert not (tmp_path / "new").exists()
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        (("--tubes", ","), "--tubes ',' names no tube"),
+        (("--cloud-topic", "/points"), "--cloud-topic given, but no .mcap file is there"),
+        (("--hint", "A1@nan,2"), "--hint A1@nan,2: expected SLOT@U,V"),
+    ],
+)
+def test_an_option_that_says_nothing_is_refused(
+    options: tuple[str, ...], words: str, small_session: Path, tmp_path: Path
+) -> None:
+    capture = small_session / "captures" / "blood-16x100-001-original"
+    one_error(tubepose("estimate", capture, "--rack", SMALL_RACK, *options, "--out", tmp_path / "out"), words)
+
+
+def test_methods_are_named_and_seeds_are_one_tube(small_session: Path, tmp_path: Path) -> None:
+    ended = tubepose(
+        "estimate", small_session, "--method", "upright,global-icp", "--seeds", "2", "--out", tmp_path / "out"
+    )
+    lines = [line for line in ended.err.splitlines() if "tubes ok" in line]
+    assert [re.search(r"; ([a-z-]+): 2 tubes ok", line)[1] for line in lines] == ["upright", "global-icp"] * 2  # type: ignore[index]
+
+
+def test_overlays_of_odd_names_do_not_meet(small_session: Path, tmp_path: Path) -> None:
+    capture = small_session / "captures" / "blood-16x100-001-original"
+    long = "\u00e4" * 120
+    for name in ("a/b", "a_b", long):
+        shutil.copytree(capture, tmp_path / "in" / name)
+    ended = tubepose(
+        "estimate", tmp_path / "in", "--rack", SMALL_RACK, "--method", "upright", "--out", tmp_path / "out"
+    )
+    assert ended.code == 0, ended.err
+    names = sorted(path.name for path in (tmp_path / "out" / "overlays").iterdir())
+    assert names == ["a_b-0000.png", "a_b-2-0000.png", f"{long[:100]}-0000.png"]

@@ -286,7 +286,8 @@ def test_noisy_depth_is_insufficient(soft_scan):
     ids=["seen", "rmse", "stray", "outside", "stretch", "through", "unseen", "slot", "uncertain"],
 )
 def test_every_threshold_can_refuse_in_words(soft_scan, change, words):
-    config = CONFIG.model_copy(update={"rack": RackConfig(**change)})
+    # Limits below zero, which a file cannot have, that nothing keeps.
+    config = CONFIG.model_copy(update={"rack": RackConfig().model_copy(update=change)})
     pose = register_rack(soft_scan, SOFT, config)
     assert pose.status is not RackStatus.OK
     assert words in pose.reason

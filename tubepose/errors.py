@@ -6,6 +6,12 @@ Bad data inside one frame is not an error but a status in the tables; a broken i
 """
 
 
+def one_line(text: str) -> str:
+    """A text without breaks, and with escapes for characters that do not print."""
+    line = " ".join(part.strip() for part in text.splitlines())
+    return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in line)
+
+
 class TubePoseError(Exception):
     """Base of all errors that a user can correct.
 
@@ -14,8 +20,7 @@ class TubePoseError(Exception):
     """
 
     def __init__(self, text: str) -> None:
-        line = " ".join(part.strip() for part in text.splitlines())
-        super().__init__("".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in line))
+        super().__init__(one_line(text))
 
 
 class LabwareError(TubePoseError):

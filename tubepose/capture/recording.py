@@ -24,6 +24,7 @@ METADATA_NAME = "tubepose"
 
 # What a cut or damaged file makes mcap and its decompressors raise (lz4: RuntimeError; checksums and text: ValueError).
 _BROKEN = (McapError, zstandard.ZstdError, struct.error, ValueError, RuntimeError)
+_MAGIC = b"\x89MCAP0\r\n"
 # Decoding one message: lengths and text that do not fit, types that are not read.
 _UNDECODABLE = (McapError, struct.error, ValueError, IndexError, NotImplementedError)
 
@@ -118,6 +119,9 @@ def _entries(path: Path) -> Iterator[_Entry | Metadata]:
     except OSError as problem:
         raise CaptureError(f"{path}: cannot be read: {problem.strerror}") from None
     with stream:
+        if not _MAGIC.startswith(stream.read(len(_MAGIC))):
+            raise InvalidMagic(b"")
+        stream.seek(0)
         for record in StreamReader(stream, validate_crcs=True).records:
             if isinstance(record, Schema):
                 schemas[record.id] = record

@@ -85,8 +85,8 @@ def open_captures(
 
     Args:
         path: A capture folder, a PLY file, an MCAP file, or a directory that is searched for them, in sorted order.
-        unit: ``m`` or ``mm``, unit of clouds: goes before `capture.yaml`; without either a cloud is in metres. Depth
-            images keep their own scale.
+        unit: ``m`` or ``mm``, unit of clouds, and of a depth image's counts where no `depth_scale_m` is given: goes
+            before `capture.yaml`; without either a cloud is in metres. Depth images in recordings keep their scale.
         cloud_topic: PointCloud2 topic of MCAP files.
         image_topic: Image or CompressedImage topic of MCAP files.
         depth_topic: Topic of depth images of MCAP files.
@@ -147,15 +147,19 @@ def _unit(unit: str | None) -> Unit | None:
     return known[unit]
 
 
-def _walk(folder: Path) -> Iterator[Path]:
-    """Capture folders and files below a folder, sorted; a capture folder is not searched further."""
+def _walk(folder: Path, inside: frozenset[Path] = frozenset()) -> Iterator[Path]:
+    """Capture folders and files below a folder, sorted; a capture folder is not searched further.
+
+    A link to a folder that it lies in leads nowhere new.
+    """
+    inside |= {folder.resolve()}
     for entry in sorted(folder.iterdir()):
         if entry.name.startswith(".") or entry.name == TRUTH_FOLDER:
             continue
-        if entry.is_dir() and not is_capture_folder(entry):
-            yield from _walk(entry)
-        else:
+        if not entry.is_dir() or is_capture_folder(entry):
             yield entry
+        elif entry.resolve() not in inside:
+            yield from _walk(entry, inside)
 
 
 def _names(root: Path, places: list[Path]) -> list[str]:
