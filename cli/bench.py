@@ -93,6 +93,7 @@ def bench(
             if fail_fast:
                 raise
             problems.append(str(problem))
+    problems = list(dict.fromkeys([*problems, *measured.problems]))  # both can miss the same file of a trial
     tables = run_estimates(
         jobs, names, detector_for, settings, out, sys.argv, seeds=seeds, overlays=overlays, fail_fast=fail_fast,
         warm_up=True, inputs=[
@@ -100,7 +101,7 @@ def bench(
             *(session.folder for session in measured.sessions),
         ],
         labware=[] if exact_truth else [s.printed_cap for s in measured.sessions if s.printed_cap is not None],
-        problems=[*problems, *measured.problems], detector=detector, ground_truth_config=measured.config,
+        problems=problems, detector=detector, ground_truth_config=measured.config,
     )  # fmt: skip
     if not len(measured.truth):
         remove_files(out, JUDGED_FILES)
@@ -108,7 +109,7 @@ def bench(
         _report(tables, measured, jobs, names, settings, out, seeds, published)
     elif measured.sessions and not exact_truth:
         say("no trial has a capture with printed caps that could be measured: no errors, no tables")
-    finish([*problems, *measured.problems, *tables.problems])
+    finish([*problems, *tables.problems])
 
 
 def _report(

@@ -74,6 +74,7 @@ def estimate(
         make_detector,
         read_methods,
         read_tubes,
+        refuse_idle_topics,
         refuse_twins,
         sessions_below,
         used_model,
@@ -105,6 +106,8 @@ def estimate(
             if fail_fast:
                 raise
             problems.append(str(problem))
+    if jobs:
+        refuse_idle_topics(jobs, topics)
     if not jobs:
         finish(problems)  # before anything of an earlier run is written over
     tables = run_estimates(

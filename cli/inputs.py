@@ -135,9 +135,6 @@ def capture_jobs(
         raise CaptureError(f"{path}: no such file or folder")
     topic = {f"{kind}_topic": name for kind, name in (topics or {}).items()}
     opened = open_captures(path, unit=unit, **topic)
-    idle = [f"--{kind}-topic" for kind, name in (topics or {}).items() if name is not None]
-    if idle and not any(capture.path.suffix.lower() == ".mcap" for capture in opened):
-        raise ConfigError(f"{path}: {', '.join(idle)} given, but no .mcap file is there that has topics; leave it out")
     told = read_hint(hint, choice.rack) if hint is not None else None
     if choice.rack is not None:
         return [Job(capture, choice.rack, tubes, told) for capture in opened], []
@@ -191,6 +188,19 @@ def refuse_twins(
         places[key] = job.capture.path
         kept.append(job)
     return kept, problems
+
+
+def refuse_idle_topics(jobs: Sequence[Job | UnnamedJob], topics: Mapping[str, str | None]) -> None:
+    """Topics are of recordings.
+
+    Raises:
+        ConfigError: One is named, and no capture is a recording.
+    """
+    from tubepose.errors import ConfigError
+
+    idle = [f"--{kind}-topic" for kind, name in topics.items() if name is not None]
+    if idle and not any(job.capture.path.suffix.lower() == ".mcap" for job in jobs):
+        raise ConfigError(f"{', '.join(idle)} given, but no .mcap file is there that has topics; leave it out")
 
 
 def used_model(detector: str, model: Path | None) -> Path | None:

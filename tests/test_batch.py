@@ -10,7 +10,7 @@ import pandas as pd
 import pytest
 import scenes
 
-from tubepose.batch import Job, Tables, UnnamedJob, run_jobs, session_jobs, trial_capture
+from tubepose.batch import MOST_ASKED, Job, Tables, UnnamedJob, run_jobs, session_jobs, trial_capture
 from tubepose.capture.frame import RgbdFrame
 from tubepose.capture.session import Session, SlotHint, load_session
 from tubepose.config import Config
@@ -247,6 +247,13 @@ def test_a_capture_whose_rack_no_frame_names_is_a_problem_and_counted() -> None:
     assert [(row["capture"], row["rack"]) for row in tables.racks] == [("good", ""), ("good", ""), ("good", RACK.name)]
     with pytest.raises(CaptureError, match="no rack fits in 0"):
         run(unnamed("bad", *frames), fail_fast=True)
+
+
+def test_a_long_recording_is_not_asked_for_ever() -> None:
+    frames = [replace(GOOD, index=index) for index in range(MOST_ASKED + 3)]
+    tables = run(unnamed("bad", *frames, nameable=(MOST_ASKED + 1,)))
+    assert [row["frame"] for row in tables.racks] == list(range(MOST_ASKED))
+    assert tables.problems == ["captures/scan: no rack fits in 0"]
 
 
 def test_a_hint_of_another_rack_is_told_in_one_line() -> None:

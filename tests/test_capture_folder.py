@@ -433,7 +433,9 @@ def write_depth_capture(folder: Path, **keys) -> None:
 def test_a_link_in_a_circle_leads_nowhere_new(tmp_path):
     write_depth_capture(tmp_path / "in" / "one")
     (tmp_path / "in" / "loop").symlink_to(tmp_path / "in")
+    (tmp_path / "in" / "up").symlink_to(tmp_path)
     (tmp_path / "in" / "again").symlink_to(tmp_path / "in" / "one")
+    write_depth_capture(tmp_path / "beside")
     assert [capture.name for capture in open_captures(tmp_path / "in")] == ["again", "one"]
 
 
@@ -444,6 +446,8 @@ def test_a_unit_that_is_typed_goes_before_the_files_for_depth_too(tmp_path):
     with pytest.raises(CaptureError, match="16-bit counts cannot be whole metres"):
         read_one(tmp_path / "one")
     np.testing.assert_array_equal(read_one(tmp_path / "one", unit="mm").cloud_m, frame.cloud_m)
+    write_depth_capture(tmp_path / "one")
+    np.testing.assert_array_equal(read_one(tmp_path / "one", unit="m").cloud_m, frame.cloud_m)  # no count is a metre
 
 
 @pytest.mark.parametrize("stamp", [-5, 10**25])

@@ -68,12 +68,14 @@ def test_a_section_cannot_be_changed_in_place():
 @pytest.mark.parametrize(
     ("text", "words"),
     [
-        ("profile: {score_tilt_rad: 0}", "score_tilt_rad: expected more than 0, found 0"),
+        ("profile: {score_tilt_rad: 0}", "score_tilt_rad: Input should be greater than 0"),
         ("rack: {min_seen: .nan}", "min_seen: .*finite"),
         ("rack: {max_inlier_rmse_m: -1}", "max_inlier_rmse_m: expected 0 or more, found -1"),
-        ("rack: {icp_distances_m: []}", "icp_distances_m: expected one or more numbers, found none"),
+        ("rack: {icp_distances_m: []}", "icp_distances_m: expected one or more numbers, all more than 0"),
         ("rack_top: {seed: -1}", "seed: expected 0 or more, found -1"),
-        ("profile: {plane_points: 0}", "plane_points: expected more than 0"),
+        ("profile: {plane_points: 0}", "plane_points: expected 1 or more, found 0"),
+        ("icp: {max_distance_m: [0]}", r"max_distance_m: expected one or more numbers, all more than 0, found \[0.0\]"),
+        ("rack: {max_stray_share: yes}", "max_stray_share: expected no yes or no"),
     ],
 )
 def test_numbers_that_would_open_a_gate_or_break_a_fit_are_refused(tmp_path, text, words):
@@ -82,6 +84,16 @@ def test_numbers_that_would_open_a_gate_or_break_a_fit_are_refused(tmp_path, tex
         load_config(tmp_path / "a.yaml")
 
 
-def test_a_limit_of_zero_switches_its_gate_off(tmp_path):
-    (tmp_path / "a.yaml").write_text("rack: {min_seen: 0}", encoding="utf-8")
-    assert load_config(tmp_path / "a.yaml").rack.min_seen == 0
+@pytest.mark.parametrize("text", ["rack: {min_seen: 0}", "slots: {open_depth_m: 0}", "profile: {shared_error_m: 0}"])
+def test_nothing_is_a_number_too(tmp_path, text):
+    (tmp_path / "a.yaml").write_text(text, encoding="utf-8")
+    (tmp_path / "b.yaml").write_text(text.replace("0", "0.5"), encoding="utf-8")
+    assert load_config(tmp_path / "a.yaml") != load_config(tmp_path / "b.yaml")
+
+
+@pytest.mark.parametrize("section", [name for name, _ in Config()])
+def test_no_setting_is_negative(section):
+    for name, value in getattr(Config(), section):
+        if not isinstance(value, bool | str):
+            with pytest.raises(ValidationError, match=name):
+                type(getattr(Config(), section))(**{name: (-1,) if isinstance(value, tuple) else -1})

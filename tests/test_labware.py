@@ -30,6 +30,7 @@ from tubepose.labware import (
 )
 from tubepose.labware.drawing import draw_labware
 from tubepose.labware.racks import SlotGrid
+from tubepose.labware.reading import read_yaml
 from tubepose.labware.tubes import TubeBody, TubeCap, WallOptics
 
 TUBES = [item for item in catalogue().values() if isinstance(item, TubeModel)]
@@ -441,12 +442,13 @@ def test_no_length_is_infinite(tmp_path, value):
         ("chen2023-soft-5x10", {"name": ".hidden"}, "a dot at the start"),
         ("chen2023-soft-5x10", {"name": "x" * 81}, "at most 80 characters"),
         ("chen2023-soft-5x10", {"name": "unknown"}, "is a word of the tables"),
-        ("chen2023-soft-5x10", {"outline_mm": [0.2, 0.1]}, "a rack is 10 mm or more each way, .*: are they metres"),
+        ("chen2023-soft-5x10", {"outline_mm": [0.2, 0.1]}, "a rack is 2 mm or more each way, .*: are they metres"),
         ("chen2023-soft-5x10", {"floor_play_mm": 100}, "more than half of the widest slot"),
         ("chen2023-soft-5x10", {"height_mm": True}, "height_mm: expected no yes or no"),
         ("chen2023-soft-5x10", {"outline_mm": [True, 90]}, "outline_mm: expected no yes or no"),
         ("chen2023-tube-2", {"classes": ["rack"]}, "'rack' is a detector's word for racks"),
         ("chen2023-tube-2", {"name": "all"}, "is a word of the tables"),
+        ("chen2023-tube-2", {"name": "NaN"}, "is a word of the tables"),
         ("chen2023-tube-2", {"classes": "red-cap"}, r"classes: expected a list in brackets"),
     ],
 )
@@ -479,3 +481,9 @@ def test_a_cap_that_floats_and_a_round_slot_with_corners_are_refused():
         TubeCap(**cap | {"top_mm": cap["height_mm"] + 1})
     with pytest.raises(ValueError, match="corner_radius_mm is of square openings"):
         SlotModel(name="A1", center_mm=(0, 0), shape="round", size_mm=(16, 16), corner_radius_mm=4)
+
+
+def test_a_merged_key_may_be_overridden(tmp_path):
+    text = "a: &A {k: 1}\nx: {y: &B {<<: *A, k: 2}}\nc: {<<: *B, j: 3}\n"
+    (tmp_path / "a.yaml").write_text(text, encoding="utf-8")
+    assert read_yaml(tmp_path / "a.yaml", LabwareError) == yaml.safe_load(text)

@@ -51,13 +51,17 @@ class Job:
     named_by_margin: float = float("nan")
 
 
+MOST_ASKED = 5
+"""Frames that are asked for their rack: a search of a whole catalogue takes seconds."""
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class UnnamedJob:
     """One capture in which a rack stands that no one named.
 
     Attributes:
         capture: Where its frames come from.
-        find_rack: Asked frame by frame until it names a rack, which then is the whole capture's.
+        find_rack: Asked frame by frame until it names a rack, which then is the whole capture's; `MOST_ASKED` times.
         tubes: The kinds of tube that can stand in it.
         hint: Which way round the rack stands, if known.
         session: Name of its session, or empty.
@@ -70,6 +74,10 @@ class UnnamedJob:
     hint: SlotHint | None = None
     session: str = ""
     trial: str = ""
+
+
+MOST_WARMED = 5
+"""Frames that are run twice at most where none has a tube."""
 
 
 @dataclass(slots=True)
@@ -149,14 +157,15 @@ def run_jobs(
         on_scene: Called with each frame's result by one of the methods, ours if it is among them (overlays).
         on_done: Called after each job (progress).
     """
-    tables = Tables()
+    tables, warmed = Tables(), 0
     for job in jobs:
         try:
             for named, frame, load_ms in _named_frames(job, methods, tables):
                 if warm_up:
                     warm = Tables()
                     _run_frame(named, frame, methods, detector_for, config, seeds, warm, tables.timings)
-                    warm_up = not warm.estimates  # a frame without tubes warms half of it
+                    warmed += 1
+                    warm_up = not warm.estimates and warmed < MOST_WARMED  # a frame without tubes warms half of it
                 load = StageTime("load", "all", "", None, load_ms)
                 _run_frame(named, frame, methods, detector_for, config, seeds, tables, None, load, on_scene)
         except TubePoseError as problem:
@@ -181,7 +190,7 @@ def _named_frames(
     Raises:
         CaptureError: No frame's rack can be named, or the hint's slot is none of the rack's.
     """
-    named, reason = job if isinstance(job, Job) else None, ""
+    named, reason, asked = job if isinstance(job, Job) else None, "", 0
     for frame, load_ms in _timed_frames(job.capture):
         if isinstance(job, UnnamedJob) and named is None:
             pose = job.find_rack(frame)
@@ -189,6 +198,9 @@ def _named_frames(
                 reason = reason or pose.reason
                 row = {**_keys(job, frame), "rack": "", **rack_pose_row(frame, pose)}
                 tables.racks += [{**row, "method": method} for method in methods]
+                asked += 1
+                if asked == MOST_ASKED:
+                    break
                 continue
             named = Job(job.capture, pose.rack, job.tubes, job.hint, job.session, job.trial, None, pose.named_by_margin)
         assert named is not None

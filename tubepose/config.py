@@ -7,11 +7,12 @@ No default was fitted to a capture that a table of ours is computed on; docs/met
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Literal, Self
+from typing import Any, Literal, Self
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import BaseModel, ConfigDict, Field, ValidationInfo, field_validator, model_validator
 
 from tubepose.errors import ConfigError
+from tubepose.labware.definition import refuse_words
 from tubepose.labware.reading import read_yaml, validate
 
 Objective = Literal["hinge", "signed", "l1", "l2", "count"]
@@ -23,18 +24,22 @@ class _Section(BaseModel):
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
+    @field_validator("*", mode="before")
+    @classmethod
+    def _no_words_as_numbers(cls, value: Any, info: ValidationInfo) -> Any:
+        return refuse_words(value, cls.model_fields[info.field_name or ""].annotation)
+
     @model_validator(mode="after")
     def _check_numbers(self) -> Self:
+        """Counts are 1 or more, and so are the numbers of a list more than 0; what else may not be 0 says so itself."""
         for name, value in self:
-            numbers = value if isinstance(value, tuple) else (value,)
-            if not numbers:
-                raise ValueError(f"{name}: expected one or more numbers, found none")
-            may_be_zero = name == "seed" or name.startswith(("min_", "max_"))  # limits: 0 switches a gate off
-            for number in numbers:
-                if isinstance(number, bool | str | BaseModel) or number > 0 or (number == 0 and may_be_zero):
-                    continue
-                expected = "0 or more" if may_be_zero else "more than 0"
-                raise ValueError(f"{name}: expected {expected}, found {number}")
+            if isinstance(value, bool | str | BaseModel):
+                continue
+            least = 1 if isinstance(value, int) and name != "seed" else 0
+            if isinstance(value, tuple) and (not value or min(value) <= 0):
+                raise ValueError(f"{name}: expected one or more numbers, all more than 0, found {list(value)}")
+            if not isinstance(value, tuple) and value < least:
+                raise ValueError(f"{name}: expected {least} or more, found {value}")
         return self
 
 
@@ -50,8 +55,8 @@ class PreprocessConfig(_Section):
     """
 
     outlier_neighbors: int = 20
-    outlier_std_ratio: float = 2.0
-    rack_voxel_m: float = 1.0e-3
+    outlier_std_ratio: float = Field(default=2.0, gt=0)
+    rack_voxel_m: float = Field(default=1.0e-3, gt=0)
     tube_max_points: int = 400
     min_tube_points: int = 25
 
@@ -76,7 +81,7 @@ class RackTopConfig(_Section):
     plane_distance_m: float = 2.0e-3
     plane_iterations: int = 300
     max_planes: int = 3
-    bin_m: float = 5.0e-4
+    bin_m: float = Field(default=5.0e-4, gt=0)
     max_bands: int = 8
     band_m: float = 2.0e-3
     outline_tolerance_m: float = 5.0e-3
@@ -127,7 +132,7 @@ class RackConfig(_Section):
     """
 
     method: RackMethod = "edges"
-    template_spacing_m: float = 5.0e-4
+    template_spacing_m: float = Field(default=5.0e-4, gt=0)
     icp_distances_m: tuple[float, ...] = (6.0e-3, 3.0e-3, 1.2e-3)
     icp_iterations: int = 60
     coarse_points: int = 2000
@@ -243,27 +248,27 @@ class ProfileConfig(_Section):
     plane_points: int = 400
     min_top_points: int = 30
     shared_error_m: float = 2.0e-5
-    shared_error_reach_m: float = 3.0e-3
+    shared_error_reach_m: float = Field(default=3.0e-3, gt=0)
     outline_noise_m: float = 1.7e-4
     outline_bias_m: float = 9.0e-5
-    widening_m: float = 3.0e-4
+    widening_m: float = Field(default=3.0e-4, gt=0)
     rim_noise_m: float = 2.0e-4
     rim_bias_m: float = 5.0e-5
     faint_rim_bias_m: float = 2.5e-4
     torn_rim_m: float = 6.0e-4
-    cap_height_m: float = 3.0e-4
+    cap_height_m: float = Field(default=3.0e-4, gt=0)
     cap_tilt_rad: float = 0.0030
-    wall_noise_m: float = 1.5e-4
-    wall_radius_m: float = 1.0e-4
-    wall_redundancy: float = 6.0
+    wall_noise_m: float = Field(default=1.5e-4, gt=0)
+    wall_radius_m: float = Field(default=1.0e-4, gt=0)
+    wall_redundancy: float = Field(default=6.0, gt=0)
     min_wall_points: int = 12
-    slope_std: float = 0.035
+    slope_std: float = Field(default=0.035, gt=0)
     slot_tolerance_m: float = 1.0e-4
     min_allowed: float = 1.0e-3
     max_height_error_m: float = 1.2e-3
     max_runner_up: float = 0.9
     max_tilt_std_rad: float = 0.0105
-    score_tilt_rad: float = 0.0035
+    score_tilt_rad: float = Field(default=0.0035, gt=0)
 
 
 class IcpConfig(_Section):
@@ -287,7 +292,7 @@ class IcpConfig(_Section):
     max_distance_m: tuple[float, ...] = (4.0e-3, 1.5e-3)
     iterations: int = 50
     estimation: Literal["point_to_plane", "point_to_point"] = "point_to_plane"
-    voxel_m: float = 1.0e-3
+    voxel_m: float = Field(default=1.0e-3, gt=0)
     normal_radius_m: float = 3.0e-3
     feature_radius_m: float = 6.0e-3
     mutual_filter: bool = False

@@ -27,8 +27,8 @@ class FolderCapture:
     Attributes:
         name: As the tables show it.
         path: The folder.
-        unit: Unit of the cloud, or of depth counts without a scale, where the user gave one; it goes before
-            `capture.yaml`.
+        unit: Unit of the cloud where the user gave one; it goes before `capture.yaml`. ``mm`` is the unit of depth
+            counts without a scale too.
     """
 
     name: str
@@ -42,7 +42,8 @@ class FolderCapture:
             CaptureError: A file is missing, cut, or does not fit the others.
         """
         found = _described(self.path) if (self.path / CAPTURE_FILE).is_file() else _guessed(self.path)
-        found = found.model_copy(update={"unit": self.unit or found.unit})
+        if self.unit is not None and (found.depth is None or self.unit != "m"):  # no depth count is a metre
+            found = found.model_copy(update={"unit": self.unit})
         scale = METRES_PER_UNIT[found.unit]
         image = read_picture(self.path / found.image) if found.image is not None else None
         if found.depth is not None:

@@ -85,8 +85,8 @@ def open_captures(
 
     Args:
         path: A capture folder, a PLY file, an MCAP file, or a directory that is searched for them, in sorted order.
-        unit: ``m`` or ``mm``, unit of clouds, and of a depth image's counts where no `depth_scale_m` is given: goes
-            before `capture.yaml`; without either a cloud is in metres. Depth images in recordings keep their scale.
+        unit: ``m`` or ``mm``, unit of clouds: goes before `capture.yaml`; without either a cloud is in metres. ``mm``
+            is the unit of a depth image's counts too where no `depth_scale_m` is given; in recordings they keep theirs.
         cloud_topic: PointCloud2 topic of MCAP files.
         image_topic: Image or CompressedImage topic of MCAP files.
         depth_topic: Topic of depth images of MCAP files.
@@ -152,7 +152,7 @@ def _walk(folder: Path, inside: frozenset[Path] = frozenset()) -> Iterator[Path]
 
     A link to a folder that it lies in leads nowhere new.
     """
-    inside |= {folder.resolve()}
+    inside |= {folder.resolve(), *folder.resolve().parents}
     for entry in sorted(folder.iterdir()):
         if entry.name.startswith(".") or entry.name == TRUTH_FOLDER:
             continue

@@ -19,13 +19,13 @@ Positive = Annotated[float, Field(gt=0)]
 NonNegative = Annotated[float, Field(ge=0)]
 
 LONGEST_NAME = 80
-RESERVED_NAMES = frozenset({"all", "none", "unknown"})
-"""What tables call all types, no type, and one that is not known."""
+RESERVED_NAMES = frozenset({"all", "none", "unknown", "na", "nan", "null", "inf"})
+"""What tables call all types, no type, and one that is not known; and what programs that read them take for nothing."""
 
 
 def _name(text: str) -> str:
     """A name that files and rows can have."""
-    if text in RESERVED_NAMES:
+    if text.lower() in RESERVED_NAMES:
         raise ValueError(f"'{text}' is a word of the tables; choose another name")
     odd = sorted({c for c in text if c in "/\\" or not c.isprintable()})
     if odd or text.startswith(".") or text != text.strip():
@@ -37,6 +37,14 @@ def _name(text: str) -> str:
 Name = Annotated[str, Field(min_length=1, max_length=LONGEST_NAME), AfterValidator(_name)]
 
 
+def refuse_words(value: Any, annotation: Any) -> Any:
+    """The value, unless it is a yes or no where none is meant: YAML reads `yes` as true, which would count as 1."""
+    parts = value if isinstance(value, list | tuple) else [value]
+    if annotation is not bool and any(isinstance(part, bool) for part in parts):
+        raise ValueError(f"expected no yes or no (found {value!r})")
+    return value
+
+
 class Definition(BaseModel):
     """Base of every definition and of its parts: frozen, and strict about unknown keys."""
 
@@ -45,12 +53,7 @@ class Definition(BaseModel):
     @field_validator("*", mode="before")
     @classmethod
     def _no_words_as_numbers(cls, value: Any, info: ValidationInfo) -> Any:
-        """YAML reads `yes` and `on` as true, which would count as 1."""
-        field = cls.model_fields[info.field_name or ""]
-        parts = value if isinstance(value, list) else [value]
-        if field.annotation is not bool and any(isinstance(part, bool) for part in parts):
-            raise ValueError(f"expected no yes or no (found {value!r})")
-        return value
+        return refuse_words(value, cls.model_fields[info.field_name or ""].annotation)
 
     def __eq__(self, other: object) -> bool:
         """Whether both define the same; what was computed of one of them, and kept, does not count."""

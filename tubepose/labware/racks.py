@@ -15,7 +15,8 @@ from pydantic import Field, model_validator
 from tubepose.labware.definition import MM, Definition, Name, NonNegative, Positive
 from tubepose.transforms import FloatArray
 
-LEAST_RACK_MM = 10.0
+LEAST_RACK_MM = 2.0
+"""Smaller measures are metres."""
 Shape = Literal["square", "round"]
 
 

@@ -25,16 +25,18 @@ _L = TypeVar("_L", RackModel, TubeModel, CapModel)
 class _Loader(yaml.SafeLoader):
     """Of two values for one key YAML keeps the last one, and so loses what was meant: refused instead."""
 
-    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
-        seen: set[str] = set()
+    def compose_mapping_node(self, anchor: Any) -> yaml.MappingNode:
+        """As written, before merge keys (`<<`) bring in what a mapping may override."""
+        node = super().compose_mapping_node(anchor)
+        seen: set[tuple[str, str]] = set()
         for key, _ in node.value:
             if not isinstance(key, yaml.ScalarNode):
                 continue
-            if key.value in seen:
+            if (key.tag, key.value) in seen:
                 told = f"the key '{key.value}' is there twice"
-                raise yaml.constructor.ConstructorError(None, None, told, key.start_mark)
-            seen.add(key.value)
-        return super().construct_mapping(node, deep)
+                raise yaml.composer.ComposerError(None, None, told, key.start_mark)
+            seen.add((key.tag, key.value))
+        return node
 
 
 def read_yaml(path: Path, error: type[TubePoseError]) -> dict[str, Any]:

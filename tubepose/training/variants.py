@@ -8,11 +8,17 @@ import numpy as np
 from pydantic import ValidationError
 
 from tubepose.labware import RackModel, TubeModel
+from tubepose.labware.definition import LONGEST_NAME
 from tubepose.labware.racks import SlotGrid, SlotShape
 from tubepose.labware.tubes import TubeBody, TubeCap
 from tubepose.transforms import FloatArray
 
 _TRIES = 20
+
+
+def _variant_name(item: RackModel | TubeModel) -> str:
+    ending = "-variant"
+    return item.name[: LONGEST_NAME - len(ending)] + ending
 
 
 def vary_tube(tube: TubeModel, rng: np.random.Generator) -> TubeModel:
@@ -36,7 +42,7 @@ def vary_tube(tube: TubeModel, rng: np.random.Generator) -> TubeModel:
                 open=cap.open,
             )
         try:
-            return TubeModel(kind="tube", name=f"{tube.name}-variant", body=TubeBody(**fields), cap=cap)
+            return TubeModel(kind="tube", name=_variant_name(tube), body=TubeBody(**fields), cap=cap)
         except ValidationError:
             continue
     return tube
@@ -61,7 +67,7 @@ def vary_rack(rack: RackModel, rng: np.random.Generator) -> RackModel:
         try:
             return RackModel(
                 kind="rack",
-                name=f"{rack.name}-variant",
+                name=_variant_name(rack),
                 outline_mm=(float(outline[0]), float(outline[1])),
                 height_mm=height,
                 floor_mm=float(np.clip(rack.floor_mm * rng.uniform(0.7, 1.5), 1.0, 0.6 * height)),
