@@ -48,8 +48,7 @@ def judge(session: Session, run: Path) -> dict[str, pd.DataFrame]:
     estimates["reason"] = estimates["reason"].fillna("")
     methods = list(racks["method"].unique())
     seeds = {name: sorted(of["seed"].dropna().astype(int).unique()) for name, of in estimates.groupby("method")}
-    exact, _ = exact_truth_rows(session)
-    truths = {"measured": measured, "exact": to_table(exact, TRUTH_COLUMNS)}
+    truths = {"measured": measured, "exact": to_table(exact_truth_rows(session), TRUTH_COLUMNS)}
     return {
         name: evaluate(estimates, truth, session.types, methods, racks=racks, seeds=seeds)
         for name, truth in truths.items()

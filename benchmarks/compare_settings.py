@@ -113,7 +113,7 @@ GROUPS: dict[str, tuple[str, Callable[[], Iterator[tuple[str, Config]]]]] = {
 def session_jobs_of(session: Session, known_rack: bool) -> list[Job]:
     """One job per trial, with the rack's exact pose if that is asked for."""
     jobs = session_jobs(session)[0]
-    return with_exact_rack(jobs, session)[0] if known_rack else jobs
+    return with_exact_rack(jobs, session) if known_rack else jobs
 
 
 def compare(
@@ -123,7 +123,7 @@ def compare(
     truth = TruthTables()
     for session in sessions:
         measure_session(session, truth, GroundTruthConfig())
-    models = {tube.name: tube for session in sessions for tube in session.tubes.values()}
+    models = {name: tube for session in sessions for name, tube in session.types.items()}
     jobs = [job for session in sessions for job in session_jobs_of(session, known_rack)]
     rows = []
     for name, config in settings:

@@ -134,7 +134,7 @@ def judge(
 ) -> tuple[pd.DataFrame, str]:
     """Rows of errors.csv of a session by its exact truth, and how many racks of how many were accepted."""
     jobs, problems = session_jobs(session)
-    jobs = with_exact_rack(jobs, session)[0] if known_rack else jobs
+    jobs = with_exact_rack(jobs, session) if known_rack else jobs
     boxes = not known_rack or any(method in TUBE_METHODS for method in methods)
     tables = run_jobs(
         jobs, methods, lambda rack, tubes: GeometricDetector(rack, tubes, config) if boxes else NoBoxes(), config
@@ -142,7 +142,7 @@ def judge(
     for problem in (*problems, *tables.problems):
         print(f"error: {problem}", file=sys.stderr)
     models = session.types
-    truth = to_table(exact_truth_rows(session)[0], TRUTH_COLUMNS)
+    truth = to_table(exact_truth_rows(session), TRUTH_COLUMNS)
     errors = evaluate(to_table(tables.estimates, ESTIMATE_COLUMNS), truth, models, methods)
     racks = pd.DataFrame(tables.racks, columns=["trial", "method", "status"]).drop_duplicates("trial")
     return errors, f"{(racks['status'] == 'ok').sum()}/{len(session.trials)}"
@@ -198,7 +198,7 @@ def report(plan: Plan, place: Path, methods: Sequence[str], out: Path, *, known_
         session = load_session(place / name)
         with pinned_threads(1):
             errors, racks = judge(session, methods, Config(), known_rack=known_rack)
-        is_open = {tube.name: tube.is_open for tube in session.tubes.values()}
+        is_open = {name: tube.is_open for name, tube in session.types.items()}
         rows += [{"factor": name, "racks": racks, **row} for row in table_rows(errors, is_open)]
         all_errors.append(errors.assign(factor=name))
         print(f"{name}: judged", file=sys.stderr, flush=True)

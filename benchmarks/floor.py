@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tubepose.labware import RackModel, TubeModel, load_rack, load_tube
-from tubepose.simulation.placement import clears_walls, lean, opening_height_m, play_at_top_m
+from tubepose.simulation.placement import clears_walls, in_disc, lean, opening_height_m, play_at_top_m
 from tubepose.simulation.variation import Tolerances
 from tubepose.transforms import FloatArray
 
@@ -76,7 +76,7 @@ def ideal_answers(
     found = []
     for held, slope in zip(*placed(rack, tube, judged, rng), strict=True):
         seen_top = held + slope * lever_m + rng.normal(0, top_std_m, 2)
-        low = disc(rng, rack.floor_play_mm * 1e-3, draws)
+        low = in_disc(rng, rack.floor_play_mm * 1e-3, draws)
         guess = (seen_top + rng.normal(0, top_std_m, (draws, 2)) - low) / lever_m
         weight = allowed(rack, tube, low, guess).astype(float)
         if np.isfinite(slope_std):
@@ -90,12 +90,6 @@ def ideal_answers(
     if np.median(answers.draws) < LEAST_DRAWS:
         raise ArithmeticError(f"{np.median(answers.draws):.0f} effective draws, {LEAST_DRAWS} expected: raise DRAWS")
     return answers
-
-
-def disc(rng: np.random.Generator, radius_m: float, count: int) -> FloatArray:
-    """Points uniform on a disc, shape (N, 2)."""
-    radius, angle = radius_m * np.sqrt(rng.uniform(size=count)), rng.uniform(0, 2 * np.pi, count)
-    return np.column_stack([radius * np.cos(angle), radius * np.sin(angle)])
 
 
 def allowed(rack: RackModel, tube: TubeModel, low_m: FloatArray, slope: FloatArray) -> NDArray[np.bool_]:

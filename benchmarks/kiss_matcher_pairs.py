@@ -74,7 +74,7 @@ def scans(folders: Sequence[str]) -> Iterator[tuple[FloatArray, TubeModel, float
     config = Config()
     for folder in folders:
         session = load_session(Path(folder))
-        for job in with_exact_rack(session_jobs(session)[0], session)[0]:
+        for job in with_exact_rack(session_jobs(session)[0], session):
             detector = GeometricDetector(job.rack, job.tubes, config)
             for frame in job.capture.frames():
                 scene = prepare_scene(frame, job.rack, job.tubes, detector, config, job.hint, job.T_camera_rack)

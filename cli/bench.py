@@ -63,7 +63,7 @@ def bench(
 
     from tubepose.batch import session_jobs
     from tubepose.config import load_config
-    from tubepose.errors import TubePoseError
+    from tubepose.errors import kept
     from tubepose.report.writing import remove_files
     from tubepose.truth_tables import with_exact_rack
     from tubepose_cli.inputs import find_sessions, make_detector, read_methods, sample_session, used_model
@@ -80,19 +80,13 @@ def bench(
     if not measured.sessions:
         finish([*problems, *measured.problems])  # before anything of an earlier run is written over
     for session in measured.sessions:
-        try:
+        keep = None if fail_fast else problems
+        with kept(keep):
             found, unread = session_jobs(session, fail_fast=fail_fast)
+            problems += unread
             if all_tubes:
                 found = [replace(job, tubes=tuple(session.types.values())) for job in found]
-            problems += unread
-            if known_rack:
-                found, unread = with_exact_rack(found, session, fail_fast=fail_fast)
-                problems += unread
-            jobs += found
-        except TubePoseError as problem:
-            if fail_fast:
-                raise
-            problems.append(str(problem))
+            jobs += with_exact_rack(found, session, keep) if known_rack else found
     problems = list(dict.fromkeys([*problems, *measured.problems]))  # both can miss the same file of a trial
     tables = run_estimates(
         jobs, names, detector_for, settings, out, sys.argv, seeds=seeds, overlays=overlays, fail_fast=fail_fast,
@@ -103,12 +97,12 @@ def bench(
         labware=[] if exact_truth else [s.printed_cap for s in measured.sessions if s.printed_cap is not None],
         problems=problems, detector=detector, ground_truth_config=measured.config,
     )  # fmt: skip
-    if not len(measured.truth):
-        remove_files(out, JUDGED_FILES)
     if len(measured.truth):
         _report(tables, measured, jobs, names, settings, out, seeds, published)
-    elif measured.sessions and not exact_truth:
-        say("no trial has a capture with printed caps that could be measured: no errors, no tables")
+    else:
+        remove_files(out, JUDGED_FILES)
+        if not exact_truth:
+            say("no trial has a capture with printed caps that could be measured: no errors, no tables")
     finish([*problems, *tables.problems])
 
 

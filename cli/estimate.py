@@ -68,7 +68,7 @@ def estimate(
     from tubepose.batch import Job, UnnamedJob
     from tubepose.capture.session import SESSION_FILE, is_session
     from tubepose.config import load_config
-    from tubepose.errors import CaptureError, TubePoseError
+    from tubepose.errors import CaptureError, kept
     from tubepose_cli.inputs import (
         capture_jobs,
         make_detector,
@@ -93,23 +93,18 @@ def estimate(
     problems: list[str] = []
     captures = [found for path in captures for found in (sessions_below(path) or [path])]
     for path in captures:
-        try:
+        with kept(None if fail_fast else problems):
             found, unread = capture_jobs(
                 path, choice, tube_models, settings, unit=unit, hint=hint, topics=topics, fail_fast=fail_fast
             )
-            kept, twins = refuse_twins(found, jobs)
+            distinct, twins = refuse_twins(found, jobs)
             if twins and fail_fast:
                 raise CaptureError(twins[0])
-            jobs += kept
+            jobs += distinct
             problems += [*unread, *twins]
-        except TubePoseError as problem:
-            if fail_fast:
-                raise
-            problems.append(str(problem))
-    if jobs:
-        refuse_idle_topics(jobs, topics)
     if not jobs:
         finish(problems)  # before anything of an earlier run is written over
+    refuse_idle_topics(jobs, topics)
     tables = run_estimates(
         jobs, methods, detector_for, settings, out, sys.argv, seeds=seeds, overlays=overlays, fail_fast=fail_fast,
         inputs=[

@@ -159,13 +159,9 @@ def read_hint(text: str, rack: RackModel | None) -> SlotHint:
             raise ValueError(pixel)
     except ValueError:
         raise ConfigError(f"--hint {text}: expected SLOT@U,V, for example A1@412,300") from None
-    if rack is not None and slot not in {known.name for known in rack.all_slots}:
-        raise ConfigError(f"--hint {text}: no slot {slot} in rack {rack.name}; {_slot_range(rack)}")
+    if rack is not None and not rack.has_slot(slot):
+        raise ConfigError(f"--hint {text}: no slot {slot} in rack {rack.name}; {rack.slot_words}")
     return SlotHint(slot=slot, pixel=(u, v))
-
-
-def _slot_range(rack: RackModel) -> str:
-    return f"its slots run from {rack.all_slots[0].name} to {rack.all_slots[-1].name}"
 
 
 def refuse_twins(

@@ -48,7 +48,7 @@ def measure_sessions(
     from dataclasses import asdict
 
     from tubepose.capture.session import load_session
-    from tubepose.errors import CaptureError, TubePoseError
+    from tubepose.errors import CaptureError, kept
     from tubepose.ground_truth import GroundTruthConfig
     from tubepose.provenance import pinned_threads
     from tubepose.records import to_table
@@ -67,7 +67,7 @@ def measure_sessions(
     sessions: list[Session] = []
     problems: list[str] = []
     for folder in folders:
-        try:
+        with kept(None if fail_fast else problems):
             session = load_session(folder)
             twin = next((other for other in sessions if other.name == session.name), None)
             if twin is not None:
@@ -75,10 +75,6 @@ def measure_sessions(
                 raise CaptureError(f"{folder}: {same}; change 'name' in one of them")
             _refuse_other_definitions(session, sessions)
             sessions.append(session)
-        except TubePoseError as problem:
-            if fail_fast:
-                raise
-            problems.append(str(problem))
     config = GroundTruthConfig()
     tables = TruthTables()
     if not sessions:
@@ -90,14 +86,9 @@ def measure_sessions(
             if not exact:
                 measure_session(session, tables, config, fail_fast=fail_fast, on_done=step)
                 continue
-            try:
-                rows, unread = exact_truth_rows(session, fail_fast=fail_fast)
-                tables.truth += rows
-                tables.problems += unread
-            except TubePoseError as problem:
-                if fail_fast:
-                    raise
-                tables.problems.append(str(problem))
+            keep = None if fail_fast else tables.problems
+            with kept(keep):
+                tables.truth += exact_truth_rows(session, keep)
     truth, floor = to_table(tables.truth, TRUTH_COLUMNS), to_table(tables.floor, FLOOR_COLUMNS)
     write_csv(out / "ground_truth.csv", truth)
     notes = [EXACT_NOTE if exact else refused_note(truth)]

@@ -8,13 +8,14 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 
 from tubepose.capture.frame import RgbdFrame
 from tubepose.capture.session import Session, SlotHint, Trial
 from tubepose.capture.source import Capture, open_captures
 from tubepose.config import Config
 from tubepose.detection import Detector
-from tubepose.errors import CaptureError, TubePoseError
+from tubepose.errors import CaptureError, TubePoseError, kept
 from tubepose.labware import Labware, RackModel, TubeModel
 from tubepose.pipeline import DEFAULT_METHOD, STOCHASTIC, Scene, StageTime, TubeEstimate, estimate_tubes, prepare_scene
 from tubepose.rack import RackPose, RackStatus
@@ -107,16 +108,12 @@ def session_jobs(session: Session, *, fail_fast: bool = False) -> tuple[list[Job
     Raises:
         CaptureError: A capture is not there, and `fail_fast` is set.
     """
-    jobs, problems = [], []
+    jobs: list[Job] = []
+    problems: list[str] = []
     for trial in session.trials:
-        try:
+        with kept(None if fail_fast else problems):
             capture = trial_capture(session, trial, trial.original)
-        except CaptureError as problem:
-            if fail_fast:
-                raise
-            problems.append(str(problem))
-            continue
-        jobs.append(Job(capture, session.rack, session.tubes_of(trial), trial.hint, session.name, trial.name))
+            jobs.append(Job(capture, session.rack, session.tubes_of(trial), trial.hint, session.name, trial.name))
     return jobs, problems
 
 
@@ -159,7 +156,7 @@ def run_jobs(
     """
     tables, warmed = Tables(), 0
     for job in jobs:
-        try:
+        with kept(None if fail_fast else tables.problems, partial(_one_line, job)):
             for named, frame, load_ms in _named_frames(job, methods, tables):
                 if warm_up:
                     warm = Tables()
@@ -168,10 +165,6 @@ def run_jobs(
                     warm_up = not warm.estimates and warmed < MOST_WARMED  # a frame without tubes warms half of it
                 load = StageTime("load", "all", "", None, load_ms)
                 _run_frame(named, frame, methods, detector_for, config, seeds, tables, None, load, on_scene)
-        except TubePoseError as problem:
-            if fail_fast:
-                raise
-            tables.problems.append(_one_line(job, problem))
         if on_done is not None:
             on_done()
     return tables
@@ -211,11 +204,10 @@ def _named_frames(
 
 
 def _check_hint(job: Job) -> None:
-    names = [slot.name for slot in job.rack.all_slots]
-    if job.hint is not None and job.hint.slot not in names:
+    if job.hint is not None and not job.rack.has_slot(job.hint.slot):
         raise CaptureError(
             f"{job.capture.path}: the hint speaks of slot {job.hint.slot}, and rack {job.rack.name} has none of that "
-            f"name; its slots run from {names[0]} to {names[-1]}"
+            f"name; {job.rack.slot_words}"
         )
 
 

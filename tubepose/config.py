@@ -7,27 +7,20 @@ No default was fitted to a capture that a table of ours is computed on; docs/met
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any, Literal, Self
+from typing import Literal, Self
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationInfo, field_validator, model_validator
+from pydantic import BaseModel, Field, model_validator
 
 from tubepose.errors import ConfigError
-from tubepose.labware.definition import refuse_words
+from tubepose.labware.definition import StrictModel
 from tubepose.labware.reading import read_yaml, validate
 
 Objective = Literal["hinge", "signed", "l1", "l2", "count"]
 RackMethod = Literal["edges", "obb-icp"]
 
 
-class _Section(BaseModel):
-    """Strict about keys and numbers: a gate of NaN would be open, and nothing here means anything below zero."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
-
-    @field_validator("*", mode="before")
-    @classmethod
-    def _no_words_as_numbers(cls, value: Any, info: ValidationInfo) -> Any:
-        return refuse_words(value, cls.model_fields[info.field_name or ""].annotation)
+class _Section(StrictModel):
+    """A gate of NaN would be open, and nothing here means anything below zero."""
 
     @model_validator(mode="after")
     def _check_numbers(self) -> Self:

@@ -5,6 +5,9 @@ The command line prints it and exits with 1; a batch records it and goes on with
 Bad data inside one frame is not an error but a status in the tables; a broken invariant is an ordinary exception.
 """
 
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+
 
 def one_line(text: str) -> str:
     """A text without breaks, and with escapes for characters that do not print."""
@@ -37,3 +40,14 @@ class DetectorError(TubePoseError):
 
 class ConfigError(TubePoseError):
     """A configuration file or an option is wrong."""
+
+
+@contextmanager
+def kept(problems: list[str] | None, words: Callable[[TubePoseError], str] = str) -> Iterator[None]:
+    """Where a batch goes on: an error inside is one more line of `problems`; it is raised if that is None."""
+    try:
+        yield
+    except TubePoseError as problem:
+        if problems is None:
+            raise
+        problems.append(words(problem))

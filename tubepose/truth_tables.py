@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -11,7 +12,7 @@ import pandas as pd
 
 from tubepose.batch import Job, trial_capture
 from tubepose.capture.session import Session, Trial
-from tubepose.errors import CaptureError, ConfigError, TubePoseError
+from tubepose.errors import CaptureError, ConfigError, TubePoseError, kept
 from tubepose.ground_truth import GroundTruthConfig, GroundTruthResult, measure_ground_truth
 from tubepose.pose_errors import pose_errors
 from tubepose.records import POSE_COLUMNS, Row, pose_columns
@@ -62,15 +63,15 @@ def measure_session(
 ) -> None:
     """Measure every trial of a session that has a printed capture, and add its rows to `tables`."""
     for trial in session.trials:
-        try:
+        with kept(None if fail_fast else tables.problems, partial(_told_of, session, trial)):
             if trial.printed is not None:
                 _measure_trial(session, trial, tables, config)
-        except TubePoseError as problem:
-            if fail_fast:
-                raise
-            tables.problems.append(f"session {session.name}, trial {trial.name}, ground truth: {problem}")
         if on_done is not None:
             on_done()
+
+
+def _told_of(session: Session, trial: Trial, problem: TubePoseError) -> str:
+    return f"session {session.name}, trial {trial.name}, ground truth: {problem}"
 
 
 def _measure_trial(session: Session, trial: Trial, tables: TruthTables, config: GroundTruthConfig) -> None:
@@ -128,26 +129,23 @@ def _errors(T_truth: FloatArray, T_measured: FloatArray, height_m: float) -> Row
     return {name: float(getattr(found, name)[0]) for name in FLOOR_COLUMNS[4:]}
 
 
-def exact_truth_rows(session: Session, *, fail_fast: bool = True) -> tuple[list[Row], list[str]]:
+def exact_truth_rows(session: Session, problems: list[str] | None = None) -> list[Row]:
     """The exact poses of a simulated session as rows of ground_truth.csv: every declared tube, none refused.
 
-    Returns:
-        The rows, and one line per trial whose exact truth is not there, or knows nothing of a declared tube.
+    Args:
+        session: The session.
+        problems: Gets a line per trial whose exact truth is not there, or knows nothing of a declared tube.
 
     Raises:
         ConfigError: The session is recorded.
-        CaptureError: What would be a line, if `fail_fast`.
+        CaptureError: What would be a line, where `problems` is None.
     """
     _refuse_recorded(session, "exact poses")
-    rows, problems = [], []
+    rows: list[Row] = []
     for trial in session.trials:
-        try:
+        with kept(problems):
             rows += _exact_trial_rows(session, trial)
-        except TubePoseError as problem:
-            if fail_fast:
-                raise
-            problems.append(str(problem))
-    return rows, problems
+    return rows
 
 
 def _refuse_recorded(session: Session, what: str) -> None:
@@ -167,28 +165,24 @@ def _exact_trial_rows(session: Session, trial: Trial) -> list[Row]:
     return rows
 
 
-def with_exact_rack(jobs: Sequence[Job], session: Session, *, fail_fast: bool = True) -> tuple[list[Job], list[str]]:
+def with_exact_rack(jobs: Sequence[Job], session: Session, problems: list[str] | None = None) -> list[Job]:
     """The jobs of a simulated session with the rack's exact pose, to tell the rack's error from the tubes'.
 
-    Returns:
-        The jobs, and one line per trial whose exact truth is not there.
+    Args:
+        jobs: Of the session's trials.
+        session: The session.
+        problems: Gets a line per trial whose exact truth is not there; its job is left out.
 
     Raises:
         ConfigError: The session is recorded.
-        CaptureError: What would be a line, if `fail_fast`.
+        CaptureError: What would be a line, where `problems` is None.
     """
     _refuse_recorded(session, "the rack's exact pose")
-    found, problems = [], []
+    found: list[Job] = []
     for job in jobs:
-        try:
-            exact = read_exact_truth(session.folder, job.trial)
-        except TubePoseError as problem:
-            if fail_fast:
-                raise
-            problems.append(str(problem))
-            continue
-        found.append(replace(job, T_camera_rack=exact.T_camera_rack))
-    return found, problems
+        with kept(problems):
+            found.append(replace(job, T_camera_rack=read_exact_truth(session.folder, job.trial).T_camera_rack))
+    return found
 
 
 def floor_note(floor: pd.DataFrame) -> str:

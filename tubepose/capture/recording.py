@@ -14,6 +14,7 @@ from mcap.exceptions import EndOfFile, InvalidMagic, McapError, RecordLengthLimi
 from mcap.records import Channel, Message, Metadata, Schema
 from mcap.stream_reader import StreamReader
 from mcap.well_known import MessageEncoding, SchemaEncoding
+from mcap.writer import MCAP0_MAGIC
 from mcap_ros2.decoder import DecoderFactory
 
 from tubepose.capture.message_types import DEFINITIONS
@@ -24,9 +25,8 @@ METADATA_NAME = "tubepose"
 
 # What a cut or damaged file makes mcap and its decompressors raise (lz4: RuntimeError; checksums and text: ValueError).
 _BROKEN = (McapError, zstandard.ZstdError, struct.error, ValueError, RuntimeError)
-_MAGIC = b"\x89MCAP0\r\n"
-# Decoding one message: lengths and text that do not fit, types that are not read.
-_UNDECODABLE = (McapError, struct.error, ValueError, IndexError, NotImplementedError)
+# Decoding one message: lengths and text that do not fit.
+_UNDECODABLE = (McapError, struct.error, ValueError, IndexError)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -46,7 +46,7 @@ class Recording:
     def broken_text(self, path: Path, frames: int) -> str:
         """One line about the cut, with the number of frames before it."""
         cut = isinstance(self.broken, EndOfFile | RecordLengthLimitExceeded | struct.error)
-        reason = f" ({' '.join(str(self.broken).split())})" if str(self.broken) else ""
+        reason = f" ({self.broken})" if str(self.broken) else ""
         return (
             f"{path}: truncated{'' if cut else ' or damaged'} after {frames} whole frame(s){reason}; "
             "copy or record it again to have the rest"
@@ -119,7 +119,7 @@ def _entries(path: Path) -> Iterator[_Entry | Metadata]:
     except OSError as problem:
         raise CaptureError(f"{path}: cannot be read: {problem.strerror}") from None
     with stream:
-        if not _MAGIC.startswith(stream.read(len(_MAGIC))):
+        if not MCAP0_MAGIC.startswith(stream.read(len(MCAP0_MAGIC))):
             raise InvalidMagic(b"")
         stream.seek(0)
         for record in StreamReader(stream, validate_crcs=True).records:

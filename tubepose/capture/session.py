@@ -138,8 +138,7 @@ def _check_trials(file: Path, data: _SessionFile, rack: RackModel) -> None:
         unknown = sorted(named - known)
         if unknown:
             raise CaptureError(
-                f"{file}: trial {trial.name}: no slot {', '.join(unknown)} in rack {rack.name}; "
-                f"its slots run from {rack.all_slots[0].name} to {rack.all_slots[-1].name}"
+                f"{file}: trial {trial.name}: no slot {', '.join(unknown)} in rack {rack.name}; {rack.slot_words}"
             )
         if trial.printed is not None and data.printed_cap is None:
             raise CaptureError(

@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tubepose.capture.frame import RgbdFrame
-from tubepose.detection.model import RACK_CLASS
 from tubepose.errors import DetectorError
+from tubepose.labware.tubes import RACK_CLASS
 
 Box = tuple[float, float, float, float]
 

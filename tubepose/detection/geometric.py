@@ -11,8 +11,9 @@ from scipy.spatial import cKDTree
 
 from tubepose.capture.frame import RgbdFrame
 from tubepose.config import Config
-from tubepose.detection.model import RACK_CLASS, TUBE_CLASS, Detection
+from tubepose.detection.model import TUBE_CLASS, Detection
 from tubepose.labware import RackModel, TubeModel
+from tubepose.labware.tubes import RACK_CLASS
 from tubepose.preprocessing import TALLEST_TUBE_M, find_rack_top
 from tubepose.rack.edges import best_registration, coarse_sample
 from tubepose.rack.fit import top_frame

@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tubepose.capture.frame import RgbdFrame
+from tubepose.labware.tubes import RACK_CLASS
 
-RACK_CLASS = "rack"
 TUBE_CLASS = "tube"
 CAPPED_CLASS = "tube-capped"
 OPEN_CLASS = "tube-open"

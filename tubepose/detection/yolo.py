@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from tubepose.capture.frame import RgbdFrame
 from tubepose.detection.boxes import box_from_edges, class_words
 from tubepose.detection.closer_look import LEAST_TUBE_SCORE, look_twice
-from tubepose.detection.model import RACK_CLASS, Detection
+from tubepose.detection.model import Detection
 from tubepose.detection.yolo_decoding import (
     LAYOUT_SHAPES,
     LAYOUTS,
@@ -26,6 +26,7 @@ from tubepose.detection.yolo_decoding import (
 from tubepose.detection.yolo_input import fit_letterbox, to_8bit_rgb, to_tensor
 from tubepose.detection.yolo_session import SIZE_STEP, YoloSession, open_session
 from tubepose.errors import DetectorError
+from tubepose.labware.tubes import RACK_CLASS
 
 
 class YoloDetector:

@@ -37,23 +37,26 @@ def _name(text: str) -> str:
 Name = Annotated[str, Field(min_length=1, max_length=LONGEST_NAME), AfterValidator(_name)]
 
 
-def refuse_words(value: Any, annotation: Any) -> Any:
-    """The value, unless it is a yes or no where none is meant: YAML reads `yes` as true, which would count as 1."""
-    parts = value if isinstance(value, list | tuple) else [value]
-    if annotation is not bool and any(isinstance(part, bool) for part in parts):
-        raise ValueError(f"expected no yes or no (found {value!r})")
-    return value
+class StrictModel(BaseModel):
+    """Frozen, and strict about unknown keys, numbers that are none, and words for numbers."""
 
-
-class Definition(BaseModel):
-    """Base of every definition and of its parts: frozen, and strict about unknown keys."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True, ignored_types=(cached_property,), allow_inf_nan=False)
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
     @field_validator("*", mode="before")
     @classmethod
     def _no_words_as_numbers(cls, value: Any, info: ValidationInfo) -> Any:
-        return refuse_words(value, cls.model_fields[info.field_name or ""].annotation)
+        """YAML reads `yes` as true, which would count as 1."""
+        parts = value if isinstance(value, list | tuple) else [value]
+        is_flag = cls.model_fields[info.field_name or ""].annotation is bool
+        if not is_flag and any(isinstance(part, bool) for part in parts):
+            raise ValueError(f"expected no yes or no (found {value!r})")
+        return value
+
+
+class Definition(StrictModel):
+    """Base of every definition and of its parts."""
+
+    model_config = ConfigDict(ignored_types=(cached_property,))
 
     def __eq__(self, other: object) -> bool:
         """Whether both define the same; what was computed of one of them, and kept, does not count."""

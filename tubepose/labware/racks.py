@@ -181,6 +181,15 @@ class RackModel(Definition):
         """Every slot, in the order of the definition."""
         return self.grid.expand() if self.grid is not None else self.slots
 
+    def has_slot(self, name: str) -> bool:
+        """Whether a slot has that name."""
+        return any(slot.name == name for slot in self.all_slots)
+
+    @property
+    def slot_words(self) -> str:
+        """What to say of the names of the slots."""
+        return f"its slots run from {self.all_slots[0].name} to {self.all_slots[-1].name}"
+
     def slot(self, name: str) -> SlotModel:
         """The slot of that name; KeyError if there is none."""
         for slot in self.all_slots:

@@ -61,8 +61,7 @@ def validate(model: type[_M], data: dict[str, Any], where: str, error: type[Tube
         return model.model_validate(data)
     except ValidationError as problem:
         found = "; ".join(_explain(model, entry) for entry in problem.errors())
-        # A key may itself hold a line break.
-        raise error(f"{where}: {' '.join(found.split())}") from None
+        raise error(f"{where}: {found}") from None
 
 
 def _explain(model: type[BaseModel], entry: Any) -> str:

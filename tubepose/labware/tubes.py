@@ -17,6 +17,7 @@ from tubepose.transforms import FloatArray
 
 LEAST_TUBE_MM = 5.0
 RACK_CLASS = "rack"
+"""What detectors call a rack: no tube answers to it."""
 Material = Literal["opaque", "translucent", "transparent"]
 
 

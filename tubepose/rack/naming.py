@@ -73,7 +73,7 @@ def name_rack(
     if reason:
         return RackPose(RackStatus.REFUSED, reason), ranking
     rack, best = order[0]
-    if hint is not None and hint.slot not in {slot.name for slot in rack.all_slots}:
+    if hint is not None and not rack.has_slot(hint.slot):
         hint = None
     pose = pose_of(best, points_m, rack, config, hint, intrinsics)
     return replace(pose, rack=rack, named_by_margin=1 - _rival(ranking) / ranking[0].evidence), ranking

@@ -125,7 +125,7 @@ def lean(rack: RackModel, slot: SlotModel, model: TubeModel, rng: np.random.Gene
     """
     room = play_at_top_m(rack, slot, model)
     for _ in range(_LEAN_TRIES):
-        low = _in_disc(rng, rack.floor_play_mm * 1e-3)
+        low = in_disc(rng, rack.floor_play_mm * 1e-3)
         high = rng.uniform(-room, room)
         slope = (high - low) / (opening_height_m(rack, model) - model.pivot_height_m)
         if clears_walls(rack, slot, model, low[None], slope[None])[0]:
@@ -168,9 +168,10 @@ def clears_walls(
     return np.asarray(np.all(off <= -(r * stretch[:, None] + CLEARANCE_M), axis=1))
 
 
-def _in_disc(rng: np.random.Generator, radius_m: float) -> FloatArray:
-    radius, angle = radius_m * np.sqrt(rng.uniform()), rng.uniform(0, 2 * np.pi)
-    return np.asarray(radius * np.array([np.cos(angle), np.sin(angle)]))
+def in_disc(rng: np.random.Generator, radius_m: float, count: int | None = None) -> FloatArray:
+    """A place uniform on a disc, shape (2,), or so many of them, shape (count, 2), metres."""
+    radius, angle = radius_m * np.sqrt(rng.uniform(size=count)), rng.uniform(0, 2 * np.pi, count)
+    return np.stack([radius * np.cos(angle), radius * np.sin(angle)], axis=-1)
 
 
 def _standing(

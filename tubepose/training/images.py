@@ -21,8 +21,9 @@ from numpy.typing import NDArray
 
 from tubepose.detection.box_writing import write_yolo_txt
 from tubepose.detection.boxes import box_from_edges
-from tubepose.detection.model import CAPPED_CLASS, OPEN_CLASS, RACK_CLASS, Detection
+from tubepose.detection.model import CAPPED_CLASS, OPEN_CLASS, Detection
 from tubepose.errors import DetectorError
+from tubepose.labware.tubes import RACK_CLASS
 from tubepose.report import write_aside, write_csv, write_text
 from tubepose.simulation.parallel import in_processes
 from tubepose.training.labels import Label, label_objects

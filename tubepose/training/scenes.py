@@ -10,8 +10,9 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from tubepose.capture.frame import CameraIntrinsics
-from tubepose.detection.model import RACK_CLASS, visible_class
+from tubepose.detection.model import visible_class
 from tubepose.labware import CapModel, RackModel, TubeModel
+from tubepose.labware.tubes import RACK_CLASS
 from tubepose.simulation.meshes import Mesh, merge
 from tubepose.simulation.placement import lean
 from tubepose.training import objects

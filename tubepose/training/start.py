@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tubepose.errors import DetectorError
+from tubepose.errors import DetectorError, one_line
 
 if TYPE_CHECKING:
     import torch
@@ -100,7 +100,7 @@ def _load_checkpoint(network: torch.nn.Module, start: Path) -> None:
             {name.removeprefix("module."): value for name, value in state.items() if name.startswith("module.")}
         )
     except (OSError, KeyError, TypeError, ValueError, RuntimeError, pickle.UnpicklingError) as problem:
-        what = " ".join(str(problem).split())[:120]
+        what = one_line(str(problem))[:120]
         raise DetectorError(
             f"{start}: no checkpoint to start from ({what}); expected {CHECKPOINT} of a training with as many classes, "
             f"or a model that tubepose trained ({_MODEL_SUFFIX})"
@@ -140,7 +140,7 @@ def _read_model(start: Path, classes: Sequence[str]) -> dict[str, tuple[NDArray[
     try:
         model = onnx.load(str(start))
     except (OSError, DecodeError) as problem:
-        raise _other_network(start, " ".join(str(problem).split())[:120]) from None
+        raise _other_network(start, one_line(str(problem))[:120]) from None
     names = {prop.key: prop.value for prop in model.metadata_props}.get("names", "no names")
     if names != repr(dict(enumerate(classes))):
         raise DetectorError(
