@@ -8,7 +8,7 @@ import scenes
 
 from tubepose.config import Config
 from tubepose.labware import load_rack, load_tube
-from tubepose.rack import RackStatus, edges, looks, register_rack
+from tubepose.rack import RackStatus, edges, looks, register_rack, settling
 from tubepose.rack.acceptance import too_coarse
 from tubepose.rack.field import top_field
 from tubepose.rack.fit import filled, refine
@@ -133,12 +133,12 @@ def test_the_covariance_holds_what_repeated_scans_do():
 @pytest.mark.parametrize("slots_off", [(0, 0), (2, 0), (-1, 1)])
 def test_a_start_some_slots_off_is_moved_before_it_is_refined(monkeypatch, slots_off):
     fits = []
-    refine = edges.refine
-    monkeypatch.setattr(edges, "refine", lambda *args: fits.append(1) or refine(*args))
+    refine = settling.refine
+    monkeypatch.setattr(settling, "refine", lambda *args: fits.append(1) or refine(*args))
     assert SOFT.grid is not None
     off = translation([*(np.multiply(slots_off, SOFT.grid.pitch_mm) * 1e-3), 0.0])
     points = transform_points(T_TRUE, hidden_by(TOP, SOFT.all_slots[5:30], 9e-3))
-    found = edges.register_at(points, T_TRUE @ off, SOFT, CONFIG.rack)
+    found = settling.register_at(points, T_TRUE @ off, SOFT, CONFIG.rack)
     degrees, millimetres = error(found.fit)
     assert degrees < 0.05
     assert millimetres < 0.05

@@ -111,16 +111,19 @@ class RackConfig(_Section):
             1.7 %).
         min_rims: Smallest share of the points expected near edges of openings: with fewer, the openings are wider.
         max_through_share: Largest share of what is seen in place of ribs that lies below them (right rack: 3 %).
-        min_seen: Smallest share of the template that is seen: a rack full of caps shows 17 %.
+        min_seen: Smallest share of the template that is seen: a rack full of caps shows 5 to 24 %.
+        min_seen_held: The same where the tops of what stands in the rack tell its level.
+        min_rims_held: min_rims there: caps hide edges before they hide ribs.
         clear_seen: With this share seen, an accepted pose is not compared with all others that the search can find.
         max_unseen_share: Largest share of the top with no points on it, above or below: half of it makes a rack of
             another shape fit.
         min_slot_margin: Smallest evidence, in nats, against the rack standing a slot farther.
         min_rival_ratio: Smallest ratio of the evidence of a pose to that of the next one that is accepted too.
-        max_level_deg: Where less than clear_seen is seen, the largest tilt off the level that the search found.
-        max_level_deg: float = 1.5
-    max_turn_std_deg: Largest standard deviation of a pose about any axis.
+        max_level_deg: Where less than clear_seen is seen, the largest tilt off the level that the search found, unless
+            tops of tubes hold the rack.
+        max_turn_std_deg: Largest standard deviation of a pose about any axis.
         max_shift_std_mm: Largest standard deviation of a pose along any axis.
+        max_shift_std_held_mm: The same where tops of tubes hold the rack.
         max_spacing_ratio: Largest point spacing, in units of the rack's narrowest rib; coarser is insufficient.
     """
 
@@ -143,6 +146,8 @@ class RackConfig(_Section):
     min_rims: float = 0.4
     max_through_share: float = 0.1
     min_seen: float = 0.1
+    min_seen_held: float = 0.03
+    min_rims_held: float = 0.2
     clear_seen: float = 0.25
     max_unseen_share: float = 0.4
     min_slot_margin: float = 10.0
@@ -150,6 +155,7 @@ class RackConfig(_Section):
     max_level_deg: float = 1.5
     max_turn_std_deg: float = 0.3
     max_shift_std_mm: float = 0.3
+    max_shift_std_held_mm: float = 0.5
     max_spacing_ratio: float = 1.0
 
 

@@ -30,6 +30,8 @@ JUDGED_M = (0.3e-3, 0.6e-3)
 RIM_M = 0.7e-3
 # Heights that tell how rough a scan is.
 SCATTER_M = 2.5e-3
+# The same where tops of tubes hold the rack: most of what shows between them is what stray light has lifted or sunk.
+HELD_SCATTER_M = 1.0e-3
 # A top that goes on across its outline is another; a rack that stands beside it may be this near.
 BORDER_M = 3.5e-3
 # Points nearer than this share their label's error: they count as one.
@@ -97,7 +99,7 @@ def measure_agreement(points_m: FloatArray, fit: Fit, rack: RackModel, config: R
     near = distance < config.judge_distance_m
     beyond = np.max(np.abs(solid[:, :2]) - rack.outline_m / 2, axis=1)
     stray = distance > config.edge_margin_m
-    ribs = _on_ribs(points_m, fit, rack)
+    ribs = _on_ribs(points_m, fit, rack, SCATTER_M if fit.level is None else HELD_SCATTER_M)
     spacing_m = _spacing(ribs[:, :2])
     scatter_m = float(1.4826 * np.median(np.abs(ribs[:, 2])))
     evidence, beside, step_m = evidence_of(seen, rack)
@@ -109,7 +111,7 @@ def measure_agreement(points_m: FloatArray, fit: Fit, rack: RackModel, config: R
         outside=float(np.mean(stray & (beyond > 0) & (beyond < BORDER_M))),
         through=under / max(under + over, 1),
         rims=_near_rims(solid[:, :2], distance, rack) / _rim_share(rack),
-        coverage=_coverage(solid, rack),
+        coverage=coverage(solid, rack),
         unseen=_unseen(points_m, fit, rack),
         evidence=evidence * alike,
         slot_margin=(evidence - beside) * alike,
@@ -130,10 +132,10 @@ def _alike(spacing_m: float) -> float:
     return min(1.0, (spacing_m / INDEPENDENT_M) ** 2)
 
 
-def _on_ribs(points_m: FloatArray, fit: Fit, rack: RackModel) -> FloatArray:
+def _on_ribs(points_m: FloatArray, fit: Fit, rack: RackModel, height_m: float) -> FloatArray:
     """Points near the solid part of the top, frame of the top, shape (N, 3), metres; rough scans have more of them."""
     T = top_frame(fit.T_camera_rack, rack)
-    local, distance, _ = kernels.laid(points_m, T[:3, :3], T[:3, 3], SCATTER_M, *top_field(rack).grid)
+    local, distance, _ = kernels.laid(points_m, T[:3, :3], T[:3, 3], height_m, *top_field(rack).grid)
     return np.asarray(local[distance < 0])
 
 
@@ -159,7 +161,8 @@ def _near_rims(xy_m: FloatArray, distance_m: NDArray[np.floating], rack: RackMod
     return float(np.mean(distance_m[inner] > -RIM_M)) if inner.any() else 0.0
 
 
-def _coverage(solid_m: FloatArray, rack: RackModel) -> float:
+def coverage(solid_m: FloatArray, rack: RackModel) -> float:
+    """Share of the cells of a rack's solid part that have one of the points (N, 2 or more), frame of its top."""
     top = picture(rack)
     half = np.array(top.shape) // 2
     i, j = np.rint(solid_m[:, 0] / PICTURE_M) + half[0], np.rint(solid_m[:, 1] / PICTURE_M) + half[1]
@@ -195,6 +198,7 @@ def contradiction(seen: Agreement, fit: Fit, rack: RackModel, config: RackConfig
 def _misfits(seen: Agreement, fit: Fit, rack: RackModel, config: RackConfig) -> tuple[tuple[bool, str], ...]:
     """What speaks for another rack, and whether it is so."""
     stretch = np.abs(fit.stretch) - 3 * fit.stretch_std
+    rims = config.min_rims if fit.level is None else config.min_rims_held
     most = config.max_stretch if seen.coverage >= config.clear_seen else 2 * config.max_stretch
     return (
         (
@@ -217,9 +221,9 @@ def _misfits(seen: Agreement, fit: Fit, rack: RackModel, config: RackConfig) -> 
             f"at most {most:.1%} expected: another rack?",
         ),
         (
-            seen.rims < config.min_rims,
+            seen.rims < rims,
             f"{seen.rims:.0%} of the points expected near the edges of the openings of {rack.name} are there, at least "
-            f"{config.min_rims:.0%} expected: another rack, with wider openings?",
+            f"{rims:.0%} expected: another rack, with wider openings?",
         ),
         (
             seen.through > config.max_through_share,
@@ -231,11 +235,13 @@ def _misfits(seen: Agreement, fit: Fit, rack: RackModel, config: RackConfig) -> 
 
 def _too_little(seen: Agreement, fit: Fit, config: RackConfig) -> tuple[tuple[bool, str], ...]:
     """What is missing to say that it is the rack, and whether it is so."""
+    most_mm = config.max_shift_std_mm if fit.level is None else config.max_shift_std_held_mm
     turn_deg, shift_mm = (float(scale * np.sqrt(np.diag(fit.covariance)[k].max())) for scale, k in _UNITS)
+    least = config.min_seen if fit.level is None else config.min_seen_held
     return (
         (
-            seen.coverage < config.min_seen,
-            f"{seen.coverage:.1%} of the top seen, at least {config.min_seen:.0%} expected",
+            seen.coverage < least,
+            f"{seen.coverage:.1%} of the top seen, at least {least:.0%} expected",
         ),
         (
             seen.unseen > config.max_unseen_share,
@@ -248,10 +254,10 @@ def _too_little(seen: Agreement, fit: Fit, config: RackConfig) -> tuple[tuple[bo
             f"(margin {seen.slot_margin:.0f} nats, at least {config.min_slot_margin:.0f} expected)",
         ),
         (
-            turn_deg > config.max_turn_std_deg or shift_mm > config.max_shift_std_mm,
+            turn_deg > config.max_turn_std_deg or shift_mm > most_mm,
             "its pose cannot be told at all: too little is seen"
             if turn_deg > LOST_DEG
             else f"its pose is uncertain by {turn_deg:.2f} deg and {shift_mm:.2f} mm (standard deviations), "
-            f"at most {config.max_turn_std_deg:g} deg, {config.max_shift_std_mm:g} mm expected: too little is seen",
+            f"at most {config.max_turn_std_deg:g} deg, {most_mm:g} mm expected: too little is seen",
         ),
     )

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import islice
 
 import numpy as np
@@ -14,27 +14,21 @@ from tubepose.config import Config, RackConfig, RackTopConfig
 from tubepose.labware import RackModel
 from tubepose.preprocessing import point_spacing_m, thin
 from tubepose.rack.acceptance import outline_words, too_coarse
-from tubepose.rack.agreement import Agreement, contradiction, measure_agreement, outline_fits, rough_evidence
+from tubepose.rack.agreement import outline_fits, rough_evidence
 from tubepose.rack.field import top_field
-from tubepose.rack.fit import Fit, RoughFit, filled, rack_frame, refine
-from tubepose.rack.looks import SLOT_STEPS, look_at, on_lattice, seen_near
+from tubepose.rack.fit import RoughFit, filled, rack_frame
+from tubepose.rack.looks import on_lattice, seen_near
 from tubepose.rack.pose import MIN_POINTS, RackPose, RackStatus, choose_turn, unused_hint
 from tubepose.rack.search import Band, levels, search
-from tubepose.transforms import HALF_TURN, FloatArray, translation
+from tubepose.rack.settling import Registration, register_at, settled
+from tubepose.transforms import HALF_TURN, FloatArray
 
 # Places whose coarse picture agrees less than this, compared with one that was accepted, are no rivals of it.
 RIVAL_WORTH = 0.4
 # The fine rounds add no more than this to a pose's evidence.
 ROUGH_MARGIN = 1.05
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Registration:
-    """A refined pose, how well the points agree with it, and why it is not believed."""
-
-    fit: Fit
-    agreement: Agreement
-    reason: str
+# A rack that tubes in so many of its slots hold is nowhere else.
+CLEAR_TOPS = 0.6
 
 
 def register_edges(
@@ -110,8 +104,8 @@ def best_registration(
             been.append(rack_frame(rough, rack))
             continue
         near_m = seen_near(points_m, rack_frame(rough, rack), rack)
-        registration = _settled(points_m, near_m, filled(rough, near_m, rack), rack, config.rack)
-        if not registration.reason and _clear(registration, config.rack):
+        registration = settled(points_m, near_m, filled(rough, near_m, rack), rack, config.rack)
+        if not registration.reason and _clear(registration, rack, config.rack):
             return registration
         registration = _level(registration, hypothesis.level, config.rack)
         if not registration.reason:
@@ -122,9 +116,12 @@ def best_registration(
     return _likeliest(found, rack, config.rack)
 
 
-def _clear(registration: Registration, config: RackConfig) -> bool:
-    """Whether no other place needs to be looked at: much is seen, and hardly a point contradicts."""
-    return registration.agreement.coverage >= config.clear_seen and _uncontradicted(registration, config)
+def _clear(registration: Registration, rack: RackModel, config: RackConfig) -> bool:
+    """Whether no other place needs to be looked at: much is seen, or much stands in it; hardly a point contradicts."""
+    seen, level = registration.agreement, registration.fit.level
+    tubes = level is not None and level.count >= CLEAR_TOPS * len(rack.all_slots)
+    clear = seen.coverage >= config.clear_seen or (tubes and seen.slot_margin >= 2 * config.min_slot_margin)
+    return clear and _uncontradicted(registration, config)
 
 
 def _uncontradicted(registration: Registration, config: RackConfig) -> bool:
@@ -172,7 +169,7 @@ def _no_rival(
 def _level(registration: Registration, level: FloatArray, config: RackConfig) -> Registration:
     """The same, refused where a pose that little is seen of does not stand as level as the rest of the scene."""
     tilt_deg = float(np.rad2deg(np.arccos(min(1.0, float(registration.fit.T_camera_rack[:3, 2] @ level)))))
-    if registration.reason or tilt_deg <= config.max_level_deg:
+    if registration.reason or registration.fit.level is not None or tilt_deg <= config.max_level_deg:
         return registration
     reason = (
         f"{registration.agreement.coverage:.1%} of the top seen, and it stands {tilt_deg:.1f} deg off the level of the "
@@ -192,32 +189,6 @@ def _same(T_a: FloatArray, T_b: FloatArray, rack: RackModel) -> bool:
 def coarse_sample(points_m: FloatArray, config: RackTopConfig) -> FloatArray:
     """What the search sees: all of a rack's points are too many, a rack in a whole frame needs more."""
     return thin(points_m, min(max(config.coarse_points, len(points_m) // 3), config.search_points))
-
-
-def register_at(points_m: FloatArray, T_camera_rack: FloatArray, rack: RackModel, config: RackConfig) -> Registration:
-    """Refine a coarse pose and judge it; where one a slot farther has more evidence, go there first."""
-    return _settled(points_m, *on_lattice(points_m, T_camera_rack, rack), rack, config)
-
-
-def _settled(
-    points_m: FloatArray, near_m: FloatArray, rough: RoughFit, rack: RackModel, config: RackConfig
-) -> Registration:
-    """The fine rounds and the judgement of a rough fit."""
-    fit = refine(rough, rack)
-    agreement = measure_agreement(near_m, fit, rack, config)
-    for _ in range(SLOT_STEPS):
-        # No step smooths what is rough, nor empties openings.
-        stray = agreement.in_slot > 2 * config.max_stray_share or agreement.rmse_m > config.max_inlier_rmse_m
-        if agreement.slot_margin >= 0 or stray:
-            break
-        T_step = translation([*agreement.step_m, 0.0])
-        near_m, rough = look_at(points_m, fit.T_camera_rack @ T_step, rack)
-        farther = refine(rough, rack)
-        there = measure_agreement(near_m, farther, rack, config)
-        if there.evidence <= agreement.evidence:
-            break
-        fit, agreement = farther, there
-    return Registration(fit, agreement, contradiction(agreement, fit, rack, config))
 
 
 def _pose(

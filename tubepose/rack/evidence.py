@@ -49,7 +49,7 @@ def likelier_step_m(rough: RoughFit, rack: RackModel) -> FloatArray | None:
 
     Told by the points at the top's height alone: a first look, before much work is put into a pose.
     """
-    here, beside = _evidence_at(at_the_top(rough), rack, 1)
+    here, beside = _evidence_at(at_the_top(rough, rough.rough_m), rack, 1)
     return slot_steps_m(rack)[int(beside.argmax())] if len(beside) and beside.max() > here else None
 
 

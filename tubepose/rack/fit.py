@@ -19,6 +19,7 @@ from tubepose.labware import RackModel
 from tubepose.rack import kernels as kernels
 from tubepose.rack import view_kernels as view_kernels
 from tubepose.rack.field import TopField, top_field
+from tubepose.rack.tops import Level
 from tubepose.transforms import FloatArray, make_transform, translation
 
 # Per round: blur of the edges (the first as wide as a coarse start may be off, the last half a pixel of 0.4 mm), and
@@ -64,6 +65,10 @@ CLUSTER_M = 20e-3
 FLOOR = np.array([5e-4, 3e-4, 2e-4, 6e-5, 6e-5, 6e-5])
 # On `dev` planes are off by twice what their residuals say, because whole sides of a rack are lifted or sunk together.
 INFLATE = np.diag([3.0, 2.5, 1.0, 1.2, 1.2, 2.0])
+# The same for a rack that is held level by tubes, by 18 simulated racks full of caps: what shows of its edges is seen
+# between caps. Light lifts its ribs, too: a standard deviation that no number of points takes away.
+INFLATE_HELD = np.diag([1.0, 1.0, 1.5, 2.2, 2.2, 2.0])
+FLOOR_HELD_M = 2e-4
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -76,6 +81,8 @@ class Fit:
         scatter_m: Standard deviation of heights about the plane, from their median, metres.
         stretch: By how much the slots lie farther apart than the rack's along x and y: 0 for the right rack.
         stretch_std: Standard deviations of that.
+        level: The tops of what stands in the rack that hold it level, where little of its own top is seen or that
+            leans otherwise; None where its own ribs tell.
     """
 
     T_camera_rack: FloatArray
@@ -83,6 +90,7 @@ class Fit:
     scatter_m: float
     stretch: FloatArray
     stretch_std: FloatArray
+    level: Level | None = None
 
 
 @dataclass(slots=True, eq=False)
@@ -96,6 +104,7 @@ class RoughFit:
         scatter_m: Standard deviation of heights about the plane, metres.
         covariance: Of the last round, shape (6, 6).
         stray: Share of the points at the top's height that lie far from its solid part.
+        level: What holds the top level; None where its own ribs tell.
     """
 
     T_camera_top: FloatArray
@@ -104,6 +113,7 @@ class RoughFit:
     scatter_m: float
     covariance: FloatArray
     stray: float = 1.0
+    level: Level | None = None
 
 
 def top_frame(T_camera_rack: FloatArray, rack: RackModel) -> FloatArray:
@@ -139,8 +149,22 @@ def refine(state: RoughFit, rack: RackModel) -> Fit:
     for number, (blur_m, widths_m) in enumerate(ROUNDS_M[ROUGH_ROUNDS:], ROUGH_ROUNDS):
         if state.stray <= HOPELESS_SHARE:
             _step(fine, state, field, blur_m, widths_m, number == len(ROUNDS_M) - 1)
-    covariance = INFLATE @ state.covariance @ INFLATE + np.diag(FLOOR**2)
-    return Fit(rack_frame(state, rack), covariance, state.scatter_m, *_stretch(state, field))
+    return Fit(rack_frame(state, rack), _covariance(state), state.scatter_m, *_stretch(state, field), state.level)
+
+
+def _covariance(state: RoughFit) -> FloatArray:
+    """Of the pose's error, shape (6, 6): that of the last round, and what it cannot know of."""
+    if state.level is None:
+        return np.asarray(INFLATE @ state.covariance @ INFLATE + np.diag(FLOOR**2))
+    covariance = INFLATE_HELD @ state.covariance @ INFLATE_HELD + np.diag(FLOOR**2)
+    covariance[:2, :2] += state.level.covariance
+    covariance[5, 5] += FLOOR_HELD_M**2
+    return np.asarray(covariance)
+
+
+def leveled(rough: RoughFit, level: Level) -> RoughFit:
+    """A rough fit, held level by the tops of what stands in the rack, to go on with."""
+    return replace(rough, T_camera_top=level.T_camera_top, scatter_m=WIDEST_M, level=level)
 
 
 def rack_frame(state: RoughFit, rack: RackModel) -> FloatArray:
@@ -148,9 +172,9 @@ def rack_frame(state: RoughFit, rack: RackModel) -> FloatArray:
     return np.asarray(state.T_camera_top @ translation([0.0, 0.0, -rack.height_m]))
 
 
-def at_the_top(state: RoughFit) -> FloatArray:
-    """Places of the rough fit's points that are at the height of its top, frame of the top, shape (N, 2), metres."""
-    local = to_frame(state.rough_m, state.T_camera_top)
+def at_the_top(state: RoughFit, points_m: FloatArray) -> FloatArray:
+    """Places of a rough fit's points (all or some) at the height of its top, frame of the top, shape (N, 2), metres."""
+    local = to_frame(points_m, state.T_camera_top)
     return local[np.abs(local[:, 2]) < max(EDGE_WINDOW_M, min(3 * state.scatter_m, WIDEST_M)), :2]
 
 
@@ -177,7 +201,8 @@ def _step(
     inside = distance < -INSIDE_M
     if inside.sum() >= LEAST_POINTS:
         plane, edges = np.ix_([0, 1, 5], [0, 1, 5]), np.ix_([2, 3, 4], [2, 3, 4])
-        move[[0, 1, 5]], state.covariance[plane], state.scatter_m = _plane(local[inside], widths_m, last)
+        held = state.level is not None
+        move[[0, 1, 5]], state.covariance[plane], state.scatter_m = _plane(local[inside], widths_m, last, held)
         move[[2, 3, 4]], state.covariance[edges] = _edges(seen, window_m, blur_m, last)
         state.stray = float(np.mean(distance[np.abs(local[:, 2]) < window_m] > STRAY_M))
     T_step = make_transform(Rotation.from_rotvec(move[:3]).as_matrix(), move[3:])
@@ -186,7 +211,7 @@ def _step(
 
 def _stretch(state: RoughFit, field: TopField) -> tuple[FloatArray, FloatArray]:
     """Stretch along x and y with which the template agrees best, and its standard deviations."""
-    xy = at_the_top(state)
+    xy = at_the_top(state, state.rough_m)
     places = np.zeros((len(xy), 3))
     moved = np.zeros(5)
     covariance = np.eye(5)
@@ -201,14 +226,14 @@ def _stretch(state: RoughFit, field: TopField) -> tuple[FloatArray, FloatArray]:
     return moved[3:], np.sqrt(np.diag(covariance))[3:]
 
 
-def _plane(points_m: FloatArray, widths_m: FloatArray, last: bool) -> tuple[FloatArray, FloatArray, float]:
+def _plane(points_m: FloatArray, widths_m: FloatArray, last: bool, held: bool) -> tuple[FloatArray, FloatArray, float]:
     """Turns about x and y, and height, of the plane where heights are densest; their covariance; their scatter.
 
     The heights that count are narrowed step by step, so that the plane ends on the mode and not on the mean: light that
     goes astray sinks or lifts whole stretches of ribs. Places count alike, not points: a wall at the outline has most.
     """
     balance = 1 / np.maximum(kernels.square_counts(points_m, SHARED_LENGTH_M), FULL_SQUARE)
-    found, scatter_m, normal, scores = kernels.plane_steps(points_m, balance, widths_m, WIDEST_M)
+    found, scatter_m, normal, scores = kernels.plane_steps(points_m, balance, widths_m, WIDEST_M, held)
     return found, _clustered(normal, scores, points_m) if last else np.eye(3), float(scatter_m)
 
 

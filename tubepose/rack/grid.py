@@ -17,11 +17,12 @@ from scipy import ndimage
 from tubepose.capture.frame import CameraIntrinsics
 from tubepose.config import Config
 from tubepose.labware import RackModel
-from tubepose.rack.edges import Registration, coarse_sample, pose_of, register_at
+from tubepose.rack.edges import coarse_sample, pose_of
 from tubepose.rack.fit import to_frame, top_frame
 from tubepose.rack.lattice import SlotLattice, countable, other_pitch
 from tubepose.rack.pose import MIN_POINTS, RackPose, RackStatus
 from tubepose.rack.search import TURN_TRIES, Band, levels, turns
+from tubepose.rack.settling import Registration, register_at
 from tubepose.transforms import FloatArray, make_transform, translation
 
 # Slots that the angle is looked for with, and how far and how finely it is turned about what was found.

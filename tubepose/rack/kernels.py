@@ -174,11 +174,13 @@ def plane_step(points_m, off_m, balance, reach_m, normal):
 
 
 @compiled
-def plane_steps(points_m, balance, widths_m, widest_m):
+def plane_steps(points_m, balance, widths_m, widest_m, held):
     """Plane of points (N, 3) where heights are densest, windows narrowed: turns about x, y and height; scatter.
 
-    Returns them with the last normal equations (3, 3) and the scores (N, 3) of the points where the steps ended.
+    Returns them with the last normal equations (3, 3) and the scores (N, 3) of the points where the steps ended. Where
+    the level is held, the height alone moves.
     """
+    stiff = 1e9 if held else 1e-9
     found = np.array([0.0, 0.0, densest(points_m[:, 2], widths_m[0])])
     off, scores = np.empty(len(points_m)), np.zeros((len(points_m), 3))
     scatter = widths_m[0]
@@ -189,7 +191,7 @@ def plane_steps(points_m, balance, widths_m, widest_m):
             off[k] = points_m[k, 2] - points_m[k, 1] * found[0] + points_m[k, 0] * found[1] - found[2]
         scatter = 1.4826 * median_size(off, max(width, 2 * scatter))
         reach = max(width, min(2 * scatter, widest_m))
-        normal = np.diag(np.array([1e-9, 1e-9, 1e-6]))
+        normal = np.diag(np.array([stiff, stiff, 1e-6]))
         found = found + solved(normal, plane_step(points_m, off, balance, reach, normal))
     for k in range(len(points_m)):
         u = off[k] / reach
@@ -198,6 +200,23 @@ def plane_steps(points_m, balance, widths_m, widest_m):
             score = balance[k] * (1.0 - u * u) ** 2 * now
             scores[k, 0], scores[k, 1], scores[k, 2] = score * points_m[k, 1], -score * points_m[k, 0], score
     return found, scatter, normal, scores
+
+
+@compiled
+def slot_heights(points_m, rotation, origin_m, centers_m, axis_m, low_m, high_m, bin_m):
+    """Points above slots (S, 2) in bins of height, within `axis_m` of their axes: how many, and the sum of heights."""
+    counts = np.zeros((len(centers_m), int((high_m - low_m) / bin_m) + 1))
+    sums = np.zeros_like(counts)
+    for k in range(len(points_m)):
+        right, ahead, up = in_frame(points_m[k], rotation, origin_m)
+        if not low_m < up < high_m:
+            continue
+        for s in range(len(centers_m)):
+            if (right - centers_m[s, 0]) ** 2 + (ahead - centers_m[s, 1]) ** 2 < axis_m * axis_m:
+                place = int((up - low_m) / bin_m)
+                counts[s, place] += 1.0
+                sums[s, place] += up
+    return counts, sums
 
 
 @compiled

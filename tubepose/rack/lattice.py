@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from tubepose.config import Config
 from tubepose.labware import RackModel, SlotGrid, SlotShape
-from tubepose.rack.edges import Registration, register_at
+from tubepose.rack.settling import Registration, register_at
 from tubepose.transforms import FloatArray
 
 # Nothing is known of the height of a top above its slots' floor: this much is assumed, and it may be off by as much.

@@ -9,9 +9,10 @@ from tubepose.capture.frame import CameraIntrinsics
 from tubepose.capture.session import SlotHint
 from tubepose.config import Config
 from tubepose.labware import RackModel, catalogue
-from tubepose.rack.edges import Registration, best_registration, coarse_sample, pose_of
+from tubepose.rack.edges import best_registration, coarse_sample, pose_of
 from tubepose.rack.pose import MIN_POINTS, RackPose, RackStatus
 from tubepose.rack.search import levels
+from tubepose.rack.settling import Registration
 from tubepose.transforms import FloatArray
 
 # Racks in a reason: the first ones tell enough.

@@ -1,0 +1,88 @@
+"""From a rough fit to a registration: the fine rounds, what holds them level, and what agrees with them or does not."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from tubepose.config import RackConfig
+from tubepose.labware import RackModel
+from tubepose.rack.agreement import Agreement, contradiction, coverage, measure_agreement
+from tubepose.rack.fit import HOPELESS_SHARE, Fit, RoughFit, at_the_top, leveled, refine, top_frame
+from tubepose.rack.looks import SLOT_STEPS, look_at, on_lattice
+from tubepose.rack.tops import Level, level_by_tops
+from tubepose.transforms import FloatArray, translation
+
+# Tops of what stands in a rack are asked where less than this share of its own is seen. They hold it where hardly any
+# is, and where its ribs lean by this many standard deviations of both.
+HIDDEN_SHARE = 0.4
+LEANS_SIGMAS = 4.0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Registration:
+    """A refined pose, how well the points agree with it, and why it is not believed."""
+
+    fit: Fit
+    agreement: Agreement
+    reason: str
+
+
+def register_at(points_m: FloatArray, T_camera_rack: FloatArray, rack: RackModel, config: RackConfig) -> Registration:
+    """Refine a coarse pose and judge it; where one a slot farther has more evidence, go there first."""
+    return settled(points_m, *on_lattice(points_m, T_camera_rack, rack), rack, config)
+
+
+def settled(
+    points_m: FloatArray, near_m: FloatArray, rough: RoughFit, rack: RackModel, config: RackConfig
+) -> Registration:
+    """The fine rounds and the judgement of a rough fit.
+
+    Args:
+        points_m: All points, camera frame, shape (N, 3), metres: where a slot farther is looked at.
+        near_m: Those near the rack.
+        rough: The fit.
+        rack: The rack.
+        config: What a registration has to pass.
+    """
+    fit = _fit(near_m, rough, rack, config)
+    agreement = measure_agreement(near_m, fit, rack, config)
+    for _ in range(SLOT_STEPS):
+        # No step smooths what is rough, nor empties openings.
+        stray = agreement.in_slot > 2 * config.max_stray_share or agreement.rmse_m > config.max_inlier_rmse_m
+        if agreement.slot_margin >= 0 or stray:
+            break
+        T_step = translation([*agreement.step_m, 0.0])
+        near_m, rough = look_at(points_m, fit.T_camera_rack @ T_step, rack)
+        farther = _fit(near_m, rough, rack, config)
+        there = measure_agreement(near_m, farther, rack, config)
+        if there.evidence <= agreement.evidence:
+            break
+        fit, agreement = farther, there
+    return Registration(fit, agreement, contradiction(agreement, fit, rack, config))
+
+
+def _fit(near_m: FloatArray, rough: RoughFit, rack: RackModel, config: RackConfig) -> Fit:
+    """The fine rounds, held level by the tops of what stands in the rack where its own top is hidden."""
+    seen = coverage(at_the_top(rough, rough.kept_m), rack)
+    if rough.stray > HOPELESS_SHARE or seen >= HIDDEN_SHARE:
+        return refine(rough, rack)
+    level = level_by_tops(near_m, rough.kept_m, rough.T_camera_top, rack)
+    if level is None:
+        return refine(rough, rack)
+    held = leveled(rough, level)
+    if seen >= config.clear_seen:
+        fit = refine(rough, rack)
+        if not _leans(fit, level, rack):
+            return fit
+    return refine(held, rack)
+
+
+def _leans(fit: Fit, level: Level, rack: RackModel) -> bool:
+    """Whether a fit stands less level than its covariance and that of the tops allow."""
+    R = top_frame(fit.T_camera_rack, rack)[:3, :3].T @ level.T_camera_top[:3, :3]
+    turn = Rotation.from_matrix(R).as_rotvec()[:2]
+    off = turn @ np.linalg.solve(fit.covariance[:2, :2] + level.covariance, turn)
+    return bool(off > LEANS_SIGMAS**2)
