@@ -240,8 +240,8 @@ class ProfileConfig(_Section):
     min_support: float = 0.3
     min_rim_support: float = 0.1
     min_rim_evidence: float = 0.11
-    min_ring_votes: float = 0.5
-    min_ring_contrast: float = 0.62
+    min_ring_votes: float = 0.55
+    min_ring_contrast: float = 0.5
     min_sectors: float = 0.4
     reach_m: float = 1.5e-3
     plane_points: int = 400

@@ -120,8 +120,7 @@ def _clear(registration: Registration, rack: RackModel, config: RackConfig) -> b
     """Whether no other place needs to be looked at: much is seen, or much stands in it; hardly a point contradicts."""
     seen, level = registration.agreement, registration.fit.level
     tubes = level is not None and level.count >= CLEAR_TOPS * len(rack.all_slots)
-    clear = seen.coverage >= config.clear_seen or (tubes and seen.slot_margin >= 2 * config.min_slot_margin)
-    return clear and _uncontradicted(registration, config)
+    return (seen.coverage >= config.clear_seen or tubes) and _uncontradicted(registration, config)
 
 
 def _uncontradicted(registration: Registration, config: RackConfig) -> bool:

@@ -27,7 +27,7 @@ BIN_M = 1e-3
 LEAST_POINTS = 20
 MOST_POINTS = 12_000
 # Planes are drawn through three tops; no farther off the level of the ribs than stray light can lift one side of them.
-DRAWS = 400
+DRAWS = 200
 STEEPEST = 0.06
 # Tops of one kind: caps sit crooked, and bottoms play on the floor.
 ALIKE_M = 0.4e-3
