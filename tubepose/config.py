@@ -147,7 +147,7 @@ class RackConfig(_Section):
     max_through_share: float = 0.1
     min_seen: float = 0.1
     min_seen_held: float = 0.03
-    min_rims_held: float = 0.2
+    min_rims_held: float = 0.3
     clear_seen: float = 0.25
     max_unseen_share: float = 0.4
     min_slot_margin: float = 10.0
