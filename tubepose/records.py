@@ -24,7 +24,7 @@ RACK_COVARIANCE_COLUMNS = upper_half(RACK_COVARIANCE_AXES)
 RACK_COLUMNS = (
     "session", "trial", "capture", "frame", "timestamp_ns", "method", "rack", "status", "reason", "ambiguous",
     "resolved_by", "hint_note", "turn_margin_m", "inlier_rmse_m", "fitness", "in_slot_share", "coverage", "spacing_m",
-    "n_tubes_detected", "box_source", "box_score", "box_note", *POSE_COLUMNS,
+    "level_tops", "n_tubes_detected", "box_source", "box_score", "box_note", *POSE_COLUMNS,
     "named_by_margin", *RACK_COVARIANCE_COLUMNS,
 )  # fmt: skip
 SLOT_COLUMNS = (
@@ -103,6 +103,7 @@ def rack_pose_row(frame: RgbdFrame, pose: RackPose) -> Row:
         "in_slot_share": pose.in_slot_share,
         "coverage": pose.coverage,
         "spacing_m": pose.spacing_m,
+        "level_tops": pose.level_tops,
         **pose_columns(pose.T_camera_rack),
         **covariance_columns(pose.covariance, RACK_COVARIANCE_COLUMNS),
     }

@@ -224,6 +224,7 @@ def _pose(
         else "",
         turn_margin_m=margin_m if index == 0 else -margin_m,
         spacing_m=seen.spacing_m,
+        level_tops=0 if reason or chosen.fit.level is None else chosen.fit.level.count,
         covariance=None if reason else _turned_covariance(chosen.fit.covariance, index == 1 and turned is best),
     )
 

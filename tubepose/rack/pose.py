@@ -48,6 +48,7 @@ class RackPose:
             z (metres), in the rack frame about the centre of the rack's top. None without a pose, and from a method
             that does not state it.
         rack: The rack that was found where it was not given but looked for; None otherwise.
+        level_tops: How many tops of what stands in it hold it level; 0 where its own top tells.
         hint_note: Why a hint that was given decided nothing, where one was needed; empty otherwise.
         named_by_margin: By how much the rack's agreement beats the next one's of the catalogue, where the rack was
             named by that: 0 is no difference; NaN otherwise.
@@ -68,6 +69,7 @@ class RackPose:
     rack: RackModel | None = None
     named_by_margin: float = float("nan")
     hint_note: str = ""
+    level_tops: int = 0
 
 
 def choose_turn(
