@@ -10,7 +10,7 @@ from test_pipeline import CONFIG, PLACED, RACK, T_CAMERA_RACK, TUBES, frame_of, 
 
 from tubepose import pipeline
 from tubepose.capture.frame import RgbdFrame
-from tubepose.detection import Detection, rows_in_box
+from tubepose.detection import Detection, points_in_box, rows_in_box
 from tubepose.detection.assisted import AssistedDetector
 from tubepose.detection.geometric import GeometricDetector
 from tubepose.detection.model import CAPPED_CLASS, OPEN_CLASS
@@ -180,11 +180,14 @@ def test_what_is_seen_of_a_tube_narrows_its_types_down():
 
 
 def test_a_margin_takes_the_points_around_a_box_in():
-    cloud = np.ones((20, 30, 3))
+    cloud = np.arange(20.0 * 30 * 3).reshape(20, 30, 3)
+    cloud[6, 8] = np.nan
     frame = RgbdFrame(cloud, None, None, None, "plain")
     box = Detection("rack", 1.0, (5.0, 4.0, 14.0, 9.0), "recorded")
-    assert len(rows_in_box(frame, box)) == 10 * 6
-    assert len(rows_in_box(frame, box, 0.2)) == 14 * 10  # 1.8 pixels more on every side
+    assert len(rows_in_box(frame, box)) == 10 * 6 - 1
+    assert len(rows_in_box(frame, box, 0.2)) == 14 * 10 - 1  # 1.8 pixels more on every side
+    for margin in (0.0, 0.2):
+        assert np.array_equal(points_in_box(frame, box, margin), frame.points_m[rows_in_box(frame, box, margin)])
 
 
 def test_a_rack_is_looked_for_in_a_little_more_than_its_box(frame, monkeypatch):

@@ -1,6 +1,7 @@
 """The stages together: from a frame with known poses to estimates, and what each stage hands on when it fails."""
 
 import dataclasses
+import re
 from dataclasses import dataclass
 
 import numpy as np
@@ -392,3 +393,22 @@ def test_a_wrong_class_costs_its_tube_and_no_other(seen):
     wrong = dataclasses.replace(seen, detections=(top_box("E10", TUBES[1], "purple-cap"),))
     ok = {e.target.slot for e in estimate_tubes(wrong, "profile", CONFIG)[0] if e.pose.status is TubeStatus.OK}
     assert ok == {"A1", "C5"}
+
+
+@pytest.mark.parametrize(
+    ("tubes", "words"), [(TUBES, "none of the given types was found"), ((), r"no tube model is given \(--tubes\)")]
+)
+def test_a_slot_where_a_detector_is_sure_and_nothing_is_found_is_not_empty(tubes, words):
+    rng = np.random.default_rng(0)
+    few = np.array([*RACK.slot("C5").center_m, 85e-3]) + rng.uniform(-4, 4, (60, 3)) * np.array([1, 1, 6]) * 1e-3
+    frame = scenes.organised(transform_points(T_CAMERA_RACK, np.vstack([scenes.rack_top(RACK), few])))
+    pixels = scenes.CAMERA.project(transform_points(T_CAMERA_RACK, few))
+    box = (*pixels.min(axis=0), *pixels.max(axis=0))
+    for score in (0.3, 0.9):
+        seen = prepare_scene(
+            frame, RACK, tubes, Fixed((Detection("tube-open", score, box, "yolo"),)), CONFIG,
+            T_camera_rack=T_CAMERA_RACK, methods=("profile",),
+        )  # fmt: skip
+        told = [e for e in estimate_tubes(seen, "profile", CONFIG)[0] if e.target.slot == "C5"]
+        assert bool(told) == (score == 0.9)
+    assert [bool(re.search(words, e.pose.reason)) for e in told] == [True]

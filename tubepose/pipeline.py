@@ -11,7 +11,7 @@ from tubepose.capture.frame import CameraIntrinsics, RgbdFrame
 from tubepose.capture.registration import estimate_intrinsics
 from tubepose.capture.session import SlotHint
 from tubepose.config import Config
-from tubepose.detection import Detection, Detector, rows_in_box
+from tubepose.detection import Detection, Detector, points_in_box
 from tubepose.detection.assisted import AssistedDetector
 from tubepose.labware import RackModel, TubeModel
 from tubepose.preprocessing import remove_outliers
@@ -171,7 +171,7 @@ def _rack_pose(
     best = best_rack(detections)
     if best is None:
         return RackPose(RackStatus.NOT_FOUND, "the detector found no rack")
-    return register_rack(frame.points_m[rows_in_box(frame, best, RACK_MARGIN)], rack, config, hint, intrinsics)
+    return register_rack(points_in_box(frame, best, RACK_MARGIN), rack, config, hint, intrinsics)
 
 
 def _may_be_helped(detector: Detector, detections: Sequence[Detection]) -> TypeGuard[AssistedDetector]:

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from tubepose.capture.frame import RgbdFrame
 from tubepose.config import Config
-from tubepose.detection import Detection, rows_in_box
+from tubepose.detection import Detection, points_in_box
 from tubepose.detection.assisted import SURE_SCORE
 from tubepose.labware import RackModel, TubeModel
 from tubepose.profile import ProfileTube
@@ -64,7 +64,8 @@ def boxes_alone(scene: Scene, found: Sequence[ProfileTube], config: Config) -> l
     # A box without edges says nothing of where its tube is seen.
     rest = [k for k, told in zip(sure, ~holds & np.isfinite(boxes[:, 0]).all(axis=1), strict=True) if told]
     taken = {tube.slot for tube in found}
-    reason = "a tube is detected here, but none of the given types was found in the slot"
+    none = "none of the given types was found in the slot" if scene.tubes else "no tube model is given (--tubes)"
+    reason = f"a tube is detected here, but {none}"
     return [
         TubeTarget(k, entry.slot, None, entry.share, reason, entry.points_m)
         for k, entry in zip(
@@ -84,7 +85,7 @@ def _assigned(
 ) -> tuple[SlotAssignment, ...]:
     """Slots of some of the detections."""
     T_rack_camera = invert_transform(T_camera_rack)
-    clouds = [transform_points(T_rack_camera, frame.points_m[rows_in_box(frame, detections[k])]) for k in chosen]
+    clouds = [transform_points(T_rack_camera, points_in_box(frame, detections[k])) for k in chosen]
     return assign_slots(clouds, rack, config.slots)
 
 

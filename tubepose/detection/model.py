@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from tubepose.capture.frame import RgbdFrame
 from tubepose.labware.tubes import RACK_CLASS
+from tubepose.transforms import FloatArray
 
 TUBE_CLASS = "tube"
 CAPPED_CLASS = "tube-capped"
@@ -76,14 +77,29 @@ def rows_in_box(frame: RgbdFrame, detection: Detection, margin: float = 0.0) -> 
     """
     if detection.point_rows is not None:
         return _valid_rows(frame, detection.point_rows)
+    (v0, v1), (u0, u1) = _pixels(frame, detection, margin)
+    grid = np.arange(v0, v1)[:, None] * frame.cloud_m.shape[1] + np.arange(u0, u1)[None, :]
+    return _valid_rows(frame, grid.reshape(-1))
+
+
+def points_in_box(frame: RgbdFrame, detection: Detection, margin: float = 0.0) -> FloatArray:
+    """Valid points that a detection selects, camera frame, shape (N, 3), metres: those of `rows_in_box`, sooner."""
+    if detection.point_rows is not None:
+        return frame.points_m[_valid_rows(frame, detection.point_rows)]
+    (v0, v1), (u0, u1) = _pixels(frame, detection, margin)
+    points_m = frame.cloud_m[v0:v1, u0:u1].reshape(-1, 3)
+    return np.compress(np.isfinite(points_m[:, 2]), points_m, axis=0)
+
+
+def _pixels(frame: RgbdFrame, detection: Detection, margin: float) -> tuple[tuple[int, int], tuple[int, int]]:
+    """First rows and columns of pixels of a box, and those after the last."""
     height, width = frame.cloud_m.shape[:2]
     left, top, right, bottom = detection.box_xyxy_px
     more = margin * max(right - left, bottom - top)
     left, top, right, bottom = left - more, top - more, right + more, bottom + more
     u0, u1 = int(np.clip(np.floor(left), 0, width)), int(np.clip(np.ceil(right) + 1, 0, width))
     v0, v1 = int(np.clip(np.floor(top), 0, height)), int(np.clip(np.ceil(bottom) + 1, 0, height))
-    grid = np.arange(v0, v1)[:, None] * width + np.arange(u0, u1)[None, :]
-    return _valid_rows(frame, grid.reshape(-1))
+    return (v0, v1), (u0, u1)
 
 
 def _valid_rows(frame: RgbdFrame, rows: NDArray[np.intp]) -> NDArray[np.intp]:
