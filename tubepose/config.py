@@ -114,7 +114,8 @@ class RackConfig(_Section):
         min_seen: Smallest share of the template that is seen: a rack full of caps shows 5 to 24 %.
         min_seen_held: The same where the tops of what stands in the rack tell its level.
         min_rims_held: min_rims there: caps hide edges before they hide ribs.
-        clear_seen: With this share seen, an accepted pose is not compared with all others that the search can find.
+        clear_seen: With this share seen, an accepted pose is not compared with all others that the search finds; with
+            less, tops of tubes hold the rack level where they can, and tubes in 60 % of its slots spare the comparison.
         max_unseen_share: Largest share of the top with no points on it, above or below: half of it makes a rack of
             another shape fit.
         min_slot_margin: Smallest evidence, in nats, against the rack standing a slot farther.

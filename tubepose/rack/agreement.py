@@ -43,7 +43,7 @@ SPACING_SAMPLE = 300
 # So many reasons are told of: the others follow from them as a rule.
 MOST_TOLD = 2
 # A pose that is known no better than this is not known at all.
-LOST_DEG = 90.0
+LOST_DEG = 45.0
 # Degrees and millimetres, with their part of a covariance.
 _UNITS = ((np.rad2deg(1.0), slice(0, 3)), (1e3, slice(3, 6)))
 
@@ -54,7 +54,8 @@ class Agreement:
 
     Attributes:
         rmse_m: RMS distance of the points near the top to its solid part, metres; the part along the normal from the
-            median of all heights within `SCATTER_M`, so that it tells a rough scan from a good one with stray light.
+            median of all heights within `SCATTER_M`, so that it tells a rough scan from a good one with stray light;
+            within `HELD_SCATTER_M` where tubes hold the rack: a rough scan has no tops that hold one.
         fitness: Share of the points at its height that are near its solid part.
         in_slot: Share of them that lie in its openings.
         through: Share of what is seen where the solid part should be that lies below it.

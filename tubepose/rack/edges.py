@@ -14,7 +14,7 @@ from tubepose.config import Config, RackConfig, RackTopConfig
 from tubepose.labware import RackModel
 from tubepose.preprocessing import point_spacing_m, thin
 from tubepose.rack.acceptance import outline_words, too_coarse
-from tubepose.rack.agreement import outline_fits, rough_evidence
+from tubepose.rack.agreement import measure_agreement, outline_fits, rough_evidence
 from tubepose.rack.field import top_field
 from tubepose.rack.fit import RoughFit, filled, rack_frame
 from tubepose.rack.looks import on_lattice, seen_near
@@ -202,6 +202,9 @@ def _pose(
     T_turned = best.fit.T_camera_rack @ HALF_TURN
     if not top_field(rack).symmetric:
         turned = register_at(points_m, T_turned, rack, config.rack)
+        if (turned.fit.level is None) != (best.fit.level is None):  # compared by the same heights
+            fit = replace(turned.fit, level=best.fit.level)
+            turned = replace(turned, fit=fit, agreement=measure_agreement(points_m, fit, rack, config.rack))
         T_turned = turned.fit.T_camera_rack
     if turned.agreement.rmse_m < best.agreement.rmse_m:
         best, turned, T_turned = turned, best, best.fit.T_camera_rack

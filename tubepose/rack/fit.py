@@ -140,7 +140,7 @@ def filled(rough: RoughFit, points_m: FloatArray, rack: RackModel) -> RoughFit:
 def _near_top(points_m: FloatArray, T_camera_top: FloatArray, rack: RackModel) -> FloatArray:
     """Points (N, 3), camera frame, a little beside a top and above and below it at most."""
     R, origin_m, reach_m = T_camera_top[:3, :3], T_camera_top[:3, 3], rack.outline_m / 2 + 5e-3
-    return np.asarray(kernels.near_top(np.ascontiguousarray(points_m, float), R, origin_m, reach_m, 5e-3))
+    return np.asarray(kernels.in_box(np.ascontiguousarray(points_m, float), R, origin_m, reach_m, -5e-3, 5e-3))
 
 
 def refine(state: RoughFit, rack: RackModel) -> Fit:
@@ -157,8 +157,13 @@ def _covariance(state: RoughFit) -> FloatArray:
     if state.level is None:
         return np.asarray(INFLATE @ state.covariance @ INFLATE + np.diag(FLOOR**2))
     covariance = INFLATE_HELD @ state.covariance @ INFLATE_HELD + np.diag(FLOOR**2)
-    covariance[:2, :2] += state.level.covariance
     covariance[5, 5] += FLOOR_HELD_M**2
+    # The height is that of ribs that may be seen at one end only: the level's error moves it at the centre.
+    seen = at_the_top(state, state.rough_m)
+    x, y = seen.mean(axis=0) if len(seen) else np.zeros(2)
+    lever = np.array([[1.0, 0], [0, 1], [-y, x]])
+    level = np.ix_([0, 1, 5], [0, 1, 5])
+    covariance[level] += lever @ state.level.covariance @ lever.T
     return np.asarray(covariance)
 
 

@@ -28,13 +28,13 @@ def in_frame(point_m, rotation, origin_m):
 
 
 @compiled
-def near_top(points_m, rotation, origin_m, reach_m, height_m):
-    """Points (N, 3) within a box about a frame's origin, unchanged: half sides `reach_m` (2,) and `height_m`."""
+def in_box(points_m, rotation, origin_m, reach_m, low_m, high_m):
+    """Points (N, 3) within a box on a frame's axes, unchanged: half sides `reach_m` (2,), between two heights."""
     kept = np.empty_like(points_m)
     count = 0
     for k in range(len(points_m)):
         right, ahead, up = in_frame(points_m[k], rotation, origin_m)
-        if abs(up) < height_m and abs(right) < reach_m[0] and abs(ahead) < reach_m[1]:
+        if low_m < up < high_m and abs(right) < reach_m[0] and abs(ahead) < reach_m[1]:
             kept[count] = points_m[k]
             count += 1
     return kept[:count]

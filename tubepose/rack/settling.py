@@ -16,7 +16,7 @@ from tubepose.rack.tops import Level, level_by_tops
 from tubepose.transforms import FloatArray, translation
 
 # Tops of what stands in a rack are asked where less than this share of its own is seen. They hold it where hardly any
-# is, and where its ribs lean by this many standard deviations of both.
+# is, and where its ribs lean by so many standard deviations of both.
 HIDDEN_SHARE = 0.4
 LEANS_SIGMAS = 4.0
 
@@ -47,8 +47,7 @@ def settled(
         rack: The rack.
         config: What a registration has to pass.
     """
-    fit = _fit(near_m, rough, rack, config)
-    agreement = measure_agreement(near_m, fit, rack, config)
+    fit, agreement = _judged(near_m, rough, rack, config)
     for _ in range(SLOT_STEPS):
         # No step smooths what is rough, nor empties openings.
         stray = agreement.in_slot > 2 * config.max_stray_share or agreement.rmse_m > config.max_inlier_rmse_m
@@ -56,28 +55,36 @@ def settled(
             break
         T_step = translation([*agreement.step_m, 0.0])
         near_m, rough = look_at(points_m, fit.T_camera_rack @ T_step, rack)
-        farther = _fit(near_m, rough, rack, config)
-        there = measure_agreement(near_m, farther, rack, config)
+        farther, there = _judged(near_m, rough, rack, config)
         if there.evidence <= agreement.evidence:
             break
         fit, agreement = farther, there
     return Registration(fit, agreement, contradiction(agreement, fit, rack, config))
 
 
-def _fit(near_m: FloatArray, rough: RoughFit, rack: RackModel, config: RackConfig) -> Fit:
-    """The fine rounds, held level by the tops of what stands in the rack where its own top is hidden."""
-    seen = coverage(at_the_top(rough, rough.kept_m), rack)
-    if rough.stray > HOPELESS_SHARE or seen >= HIDDEN_SHARE:
-        return refine(rough, rack)
+def _judged(near_m: FloatArray, rough: RoughFit, rack: RackModel, config: RackConfig) -> tuple[Fit, Agreement]:
+    """The fine rounds, held level by the tops of what stands in the rack where hardly any of its own top is seen.
+
+    Or where little is, and leans. Ribs that pass every test are believed where a rack that is held does not.
+    """
+    hopeless = rough.stray > HOPELESS_SHARE
+    free: tuple[Fit, Agreement] | None = None
+    if hopeless or coverage(at_the_top(rough, rough.kept_m), rack) >= config.clear_seen:
+        free = _by_ribs(near_m, rough, rack, config)
+        if hopeless or free[1].coverage >= HIDDEN_SHARE:
+            return free
     level = level_by_tops(near_m, rough.kept_m, rough.T_camera_top, rack)
     if level is None:
-        return refine(rough, rack)
-    held = leveled(rough, level)
-    if seen >= config.clear_seen:
-        fit = refine(rough, rack)
-        if not _leans(fit, level, rack):
-            return fit
-    return refine(held, rack)
+        return free or _by_ribs(near_m, rough, rack, config)
+    if free is not None and free[1].coverage >= config.clear_seen and not _leans(free[0], level, rack):
+        return free
+    held = refine(leveled(rough, level), rack)
+    seen = measure_agreement(near_m, held, rack, config)
+    if contradiction(seen, held, rack, config):
+        fit, alone = free or _by_ribs(near_m, rough, rack, config)
+        if not contradiction(alone, fit, rack, config):
+            return fit, alone
+    return held, seen
 
 
 def _leans(fit: Fit, level: Level, rack: RackModel) -> bool:
@@ -86,3 +93,8 @@ def _leans(fit: Fit, level: Level, rack: RackModel) -> bool:
     turn = Rotation.from_matrix(R).as_rotvec()[:2]
     off = turn @ np.linalg.solve(fit.covariance[:2, :2] + level.covariance, turn)
     return bool(off > LEANS_SIGMAS**2)
+
+
+def _by_ribs(near_m: FloatArray, rough: RoughFit, rack: RackModel, config: RackConfig) -> tuple[Fit, Agreement]:
+    fit = refine(rough, rack)
+    return fit, measure_agreement(near_m, fit, rack, config)

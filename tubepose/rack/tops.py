@@ -11,6 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import stats
 from scipy.spatial.transform import Rotation
 
 from tubepose.labware import RackModel
@@ -22,15 +23,19 @@ from tubepose.transforms import FloatArray, make_transform, translation
 # What stands out of a rack is looked for from here to there above its top, and this near the axis of its slot.
 LOW_M, HIGH_M = 5e-3, 0.15
 AXIS_M = 5e-3
-# A top is the fullest of these heights above a slot, if so many points have it; its height is the mean within a bin.
+# A top is the fullest of these heights above a slot, if so many points have it, and this share of those above the slot:
+# less is an opening, or a sensor too rough to tell a level. Its height is the mean of both bins.
 BIN_M = 1e-3
 LEAST_POINTS = 20
-MOST_POINTS = 12_000
+LEAST_SHARE = 0.7
+POINTS_PER_SLOT = 240
 # Planes are drawn through three tops; no farther off the level of the ribs than stray light can lift one side of them.
 DRAWS = 200
 STEEPEST = 0.06
-# Tops of one kind: caps sit crooked, and bottoms play on the floor.
+# Tops of one kind: caps sit crooked, and bottoms play on the floor. Two kinds that differ by little, in blocks of rows,
+# would make a plane that leans, with rows off it on either side: less likely by chance than this, they are two.
 ALIKE_M = 0.4e-3
+LEAST_CHANCE = 1e-3
 # So many of one kind hold a rack, if its level is known as well by them.
 LEAST_TOPS = 12
 LARGEST_STD_RAD = 3e-3
@@ -59,7 +64,7 @@ class Level:
 
 
 def level_by_tops(points_m: FloatArray, ribs_m: FloatArray, T_camera_top: FloatArray, rack: RackModel) -> Level | None:
-    """The level of a rack by the tops in its slots, and the height that its ribs have there; None with too few of them.
+    """The level of a rack by the tops in its slots, and the height that its ribs have there; None where they tell none.
 
     Args:
         points_m: What stands in the rack, shape (N, 3), camera frame, metres.
@@ -73,8 +78,8 @@ def level_by_tops(points_m: FloatArray, ribs_m: FloatArray, T_camera_top: FloatA
     alike = _one_kind(centers, heights)
     if np.count_nonzero(alike) < LEAST_TOPS:
         return None
-    turns, covariance = _level(centers[alike], heights[alike])
-    if np.sqrt(np.diag(covariance).max()) > LARGEST_STD_RAD:
+    turns, covariance, off = _level(centers[alike], heights[alike])
+    if np.sqrt(np.diag(covariance).max()) > LARGEST_STD_RAD or _rows_differ(centers[alike], off):
         return None
     turn = make_transform(Rotation.from_rotvec([*turns, 0.0]).as_matrix(), np.zeros(3))
     T_level = T_camera_top @ turn
@@ -82,25 +87,44 @@ def level_by_tops(points_m: FloatArray, ribs_m: FloatArray, T_camera_top: FloatA
     return Level(T_level, covariance, int(alike.sum()))
 
 
-def _level(centers_m: FloatArray, heights_m: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Turns about x and y (2,) that put tops (K,) on a level plane, and their covariance (2, 2); radians."""
+def _level(centers_m: FloatArray, heights_m: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Turns about x and y (2,) that put tops (K,) on a level plane, their covariance (2, 2), and what is left (K,)."""
     design = np.column_stack([centers_m[:, 1], -centers_m[:, 0], np.ones(len(centers_m))])
     normal = design.T @ design
     found = np.linalg.solve(normal, design.T @ heights_m)
     off = heights_m - design @ found
     variance = float(off @ off) / (len(off) - 3)
-    return np.arctan(found[:2]), INFLATE**2 * variance * np.linalg.inv(normal)[:2, :2]
+    return np.arctan(found[:2]), INFLATE**2 * variance * np.linalg.inv(normal)[:2, :2], off
+
+
+def _rows_differ(centers_m: FloatArray, off_m: FloatArray) -> bool:
+    """Whether what a plane leaves of tops (K,) goes by rows or columns (F test): they are of two kinds that differ."""
+    for axis in range(2):
+        row = np.unique(np.rint(centers_m[:, axis] / BIN_M), return_inverse=True)[1]
+        count = np.bincount(row)
+        between, within = len(count) - 2, len(off_m) - len(count) - 1
+        if between < 1 or within < 1:
+            continue
+        explained = float((np.bincount(row, off_m) ** 2 / count).sum())
+        ratio = (explained / between) / max((float(off_m @ off_m) - explained) / within, 1e-12)
+        if stats.f.sf(ratio, between, within) < LEAST_CHANCE:
+            return True
+    return False
 
 
 def _tops(points_m: FloatArray, T_camera_top: FloatArray, rack: RackModel) -> tuple[FloatArray, FloatArray]:
     """Centres (K, 2) of the slots with a top above them, and its height (K,) above the rack's; metres."""
     R, origin_m, centers = T_camera_top[:3, :3], T_camera_top[:3, 3], rack.slot_centers_m
-    counts, sums = kernels.slot_heights(thin(points_m, MOST_POINTS), R, origin_m, centers, AXIS_M, LOW_M, HIGH_M, BIN_M)
+    points_m = np.ascontiguousarray(points_m, float)
+    above_m = kernels.in_box(points_m, R, origin_m, rack.outline_m / 2, LOW_M, HIGH_M)
+    few_m = thin(above_m, POINTS_PER_SLOT * len(centers))
+    counts, sums = kernels.slot_heights(few_m, R, origin_m, centers, AXIS_M, LOW_M, HIGH_M, BIN_M)
     # Two bins side by side: a top that leans, or stands on their edge, fills both.
     both, total = counts[:, :-1] + counts[:, 1:], sums[:, :-1] + sums[:, 1:]
     slot, fullest = np.arange(len(centers)), both.argmax(axis=1)
-    full = both[slot, fullest] >= LEAST_POINTS
-    return centers[full], (total[slot, fullest] / np.maximum(both[slot, fullest], 1))[full]
+    most = both[slot, fullest]
+    full = (most >= LEAST_POINTS) & (most >= LEAST_SHARE * counts.sum(axis=1))
+    return centers[full], (total[slot, fullest] / np.maximum(most, 1))[full]
 
 
 def _one_kind(centers_m: FloatArray, heights_m: FloatArray) -> NDArray[np.bool_]:
@@ -119,9 +143,8 @@ def _one_kind(centers_m: FloatArray, heights_m: FloatArray) -> NDArray[np.bool_]
 def _height(ribs_m: FloatArray, T_camera_top: FloatArray, rack: RackModel) -> float:
     """Height of the ribs that show, over the level of a frame: that of the highest peak that counts."""
     local, distance, _ = kernels.laid(
-        ribs_m, T_camera_top[:3, :3], T_camera_top[:3, 3], PEAK_REACH_M,
-        *top_field(rack).grid,
-    )  # fmt: skip
+        ribs_m, T_camera_top[:3, :3], T_camera_top[:3, 3], PEAK_REACH_M, *top_field(rack).grid
+    )
     edges = np.arange(-PEAK_REACH_M, PEAK_REACH_M + PEAK_BIN_M / 2, PEAK_BIN_M)
     counts = np.convolve(np.histogram(local[distance < 0, 2], edges)[0], [0.5, 1, 1, 1, 0.5], "same")
     padded = np.pad(counts, 1)
