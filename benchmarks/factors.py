@@ -26,7 +26,10 @@ from tubepose.capture.manifest import Split
 from tubepose.capture.session import Session, is_session, load_session
 from tubepose.config import Config
 from tubepose.detection import Detection
+from tubepose.detection.assisted import AssistedDetector
+from tubepose.detection.bundled import bundled_model
 from tubepose.detection.geometric import GeometricDetector
+from tubepose.detection.yolo import YoloDetector
 from tubepose.errors import ConfigError, TubePoseError
 from tubepose.evaluation import evaluate, summarise
 from tubepose.labware import load_cap, load_rack, load_tube
@@ -136,8 +139,12 @@ def judge(
     jobs, problems = session_jobs(session)
     jobs = with_exact_rack(jobs, session) if known_rack else jobs
     boxes = not known_rack or any(method in TUBE_METHODS for method in methods)
+    yolo = YoloDetector(bundled_model(), threads=1) if boxes else None
     tables = run_jobs(
-        jobs, methods, lambda rack, tubes: GeometricDetector(rack, tubes, config) if boxes else NoBoxes(), config
+        jobs,
+        methods,
+        lambda rack, tubes: AssistedDetector(yolo, GeometricDetector(rack, tubes, config)) if yolo else NoBoxes(),
+        config,
     )
     for problem in (*problems, *tables.problems):
         print(f"error: {problem}", file=sys.stderr)
