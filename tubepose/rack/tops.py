@@ -11,8 +11,8 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import stats
 from scipy.spatial.transform import Rotation
+from scipy.special import fdtrc
 
 from tubepose.labware import RackModel
 from tubepose.preprocessing import thin
@@ -107,7 +107,7 @@ def _rows_differ(centers_m: FloatArray, off_m: FloatArray) -> bool:
             continue
         explained = float((np.bincount(row, off_m) ** 2 / count).sum())
         ratio = (explained / between) / max((float(off_m @ off_m) - explained) / within, 1e-12)
-        if stats.f.sf(ratio, between, within) < LEAST_CHANCE:
+        if fdtrc(between, within, ratio) < LEAST_CHANCE:
             return True
     return False
 
