@@ -134,6 +134,13 @@ def test_depth_that_scatters_by_millimetres_tells_no_level():
     assert level_of(ribs(), rough) is None
 
 
+def test_a_plate_that_lies_aslant_over_slots_is_no_row_of_tops():
+    rng = np.random.default_rng(0)
+    plate = rng.uniform([-0.095, -0.045, 0.0], [0.095, 0.045, 0.0], (40_000, 3))
+    plate[:, 2] = SOFT.height_m + 0.05 + np.tan(np.deg2rad(2.0)) * plate[:, 0] + rng.normal(0, 1e-4, len(plate))
+    assert level_of(ribs(), transform_points(T_TRUE, plate)) is None
+
+
 def test_what_stands_around_a_rack_takes_no_tops_from_it():
     rng = np.random.default_rng(0)
     table = rng.uniform([-0.3, -0.3, 0.0], [0.3, 0.3, 1e-3], (300_000, 3))

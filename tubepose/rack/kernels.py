@@ -203,20 +203,29 @@ def plane_steps(points_m, balance, widths_m, widest_m, held):
 
 
 @compiled
-def slot_heights(points_m, rotation, origin_m, centers_m, axis_m, low_m, high_m, bin_m):
-    """Points above slots (S, 2) in bins of height, within `axis_m` of their axes: how many, and the sum of heights."""
+def slot_heights(points_m, rotation, origin_m, centers_m, axis_m, between_m, low_m, high_m, bin_m):
+    """Points above slots (S, 2) in bins of height (S, B), within `axis_m` of their axes: how many, and sum of heights.
+
+    And how many are farther than `between_m` (S,) from the nearest of them, where a tube's top does not reach.
+    """
     counts = np.zeros((len(centers_m), int((high_m - low_m) / bin_m) + 1))
-    sums = np.zeros_like(counts)
+    sums, between = np.zeros_like(counts), np.zeros_like(counts)
     for k in range(len(points_m)):
         right, ahead, up = in_frame(points_m[k], rotation, origin_m)
         if not low_m < up < high_m:
             continue
+        nearest, least = 0, np.inf
         for s in range(len(centers_m)):
-            if (right - centers_m[s, 0]) ** 2 + (ahead - centers_m[s, 1]) ** 2 < axis_m * axis_m:
-                place = int((up - low_m) / bin_m)
-                counts[s, place] += 1.0
-                sums[s, place] += up
-    return counts, sums
+            distance2 = (right - centers_m[s, 0]) ** 2 + (ahead - centers_m[s, 1]) ** 2
+            if distance2 < least:
+                nearest, least = s, distance2
+        place = int((up - low_m) / bin_m)
+        if least < axis_m * axis_m:
+            counts[nearest, place] += 1.0
+            sums[nearest, place] += up
+        elif least > between_m[nearest] ** 2:
+            between[nearest, place] += 1.0
+    return counts, sums, between
 
 
 @compiled

@@ -8,9 +8,11 @@ kind of tube are on a plane that is as level as the rack, whatever the kind is a
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 from scipy.special import fdtrc
 
@@ -29,6 +31,11 @@ BIN_M = 1e-3
 LEAST_POINTS = 20
 LEAST_SHARE = 0.7
 POINTS_PER_SLOT = 240
+# Tubes stand apart: places farther from every slot's axis than this share of the distance to the next slot have no part
+# of a top, if they hang together. A plate has as many points there as above the slots.
+BETWEEN = 0.6
+PLATE_SHARE = 0.5
+AREA_STEP_M = 0.5e-3
 # Planes are drawn through three tops; no farther off the level of the ribs than stray light can lift one side of them.
 DRAWS = 200
 STEEPEST = 0.06
@@ -72,8 +79,8 @@ def level_by_tops(points_m: FloatArray, ribs_m: FloatArray, T_camera_top: FloatA
         T_camera_top: Frame of the rack's top, a few degrees off its level at most, shape (4, 4), metres.
         rack: The rack.
     """
-    centers, heights = _tops(points_m, T_camera_top, rack)
-    if len(centers) < LEAST_TOPS:
+    centers, heights, plate = _tops(points_m, T_camera_top, rack)
+    if plate or len(centers) < LEAST_TOPS:
         return None
     alike = _one_kind(centers, heights)
     if np.count_nonzero(alike) < LEAST_TOPS:
@@ -112,19 +119,33 @@ def _rows_differ(centers_m: FloatArray, off_m: FloatArray) -> bool:
     return False
 
 
-def _tops(points_m: FloatArray, T_camera_top: FloatArray, rack: RackModel) -> tuple[FloatArray, FloatArray]:
-    """Centres (K, 2) of the slots with a top above them, and its height (K,) above the rack's; metres."""
+def _tops(points_m: FloatArray, T_camera_top: FloatArray, rack: RackModel) -> tuple[FloatArray, FloatArray, bool]:
+    """Centres (K, 2) of slots with a top above them, its height (K,) above the rack's; whether they hang together."""
     R, origin_m, centers = T_camera_top[:3, :3], T_camera_top[:3, 3], rack.slot_centers_m
     points_m = np.ascontiguousarray(points_m, float)
     above_m = kernels.in_box(points_m, R, origin_m, rack.outline_m / 2, LOW_M, HIGH_M)
     few_m = thin(above_m, POINTS_PER_SLOT * len(centers))
-    counts, sums = kernels.slot_heights(few_m, R, origin_m, centers, AXIS_M, LOW_M, HIGH_M, BIN_M)
+    between_m, areas_m2 = _between(rack)
+    counts, sums, beside = kernels.slot_heights(few_m, R, origin_m, centers, AXIS_M, between_m, LOW_M, HIGH_M, BIN_M)
     # Two bins side by side: a top that leans, or stands on their edge, fills both.
     both, total = counts[:, :-1] + counts[:, 1:], sums[:, :-1] + sums[:, 1:]
     slot, fullest = np.arange(len(centers)), both.argmax(axis=1)
     most = both[slot, fullest]
     full = (most >= LEAST_POINTS) & (most >= LEAST_SHARE * counts.sum(axis=1))
-    return centers[full], (total[slot, fullest] / np.maximum(most, 1))[full]
+    joined = (beside[:, :-1] + beside[:, 1:])[slot, fullest]
+    plate = joined[full].sum() > PLATE_SHARE * (most * areas_m2 / (np.pi * AXIS_M**2))[full].sum()
+    return centers[full], (total[slot, fullest] / np.maximum(most, 1))[full], bool(plate)
+
+
+@lru_cache(maxsize=32)
+def _between(rack: RackModel) -> tuple[FloatArray, FloatArray]:
+    """How far from a slot's axis no tube's top reaches (S,), metres, and the area nearest to it beyond (S,), m^2."""
+    between_m = BETWEEN * rack.pitches_m
+    axes = [np.arange(-side / 2, side / 2, AREA_STEP_M) for side in rack.outline_m]
+    xy = np.stack(np.meshgrid(*axes), axis=-1).reshape(-1, 2)
+    distance, nearest = cKDTree(rack.slot_centers_m).query(xy)
+    beyond = np.asarray(nearest)[np.asarray(distance) > between_m[nearest]]
+    return between_m, np.asarray(np.bincount(beyond, minlength=len(between_m)) * AREA_STEP_M**2)
 
 
 def _one_kind(centers_m: FloatArray, heights_m: FloatArray) -> NDArray[np.bool_]:
