@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+
 import numpy as np
 from scipy.spatial.transform import Rotation
 
@@ -23,6 +25,13 @@ def rack_top(rack: RackModel, seed: int = 0, spacing_m: float = SPACING_M, noise
     xy += rng.uniform(-0.3, 0.3, xy.shape) * spacing_m
     xy = rng.permutation(xy[rack.top_signed_distance_m(xy) < 0])
     return np.column_stack([xy, np.full(len(xy), rack.height_m)]) + rng.normal(0, noise_m, (len(xy), 3))
+
+
+def hidden_by(top: FloatArray, places: Iterable[tuple[float, float]], reach_m: float) -> FloatArray:
+    """The points of a top, rack frame, less what is under discs about some places."""
+    for place in places:
+        top = top[np.hypot(*(top[:, :2] - place).T) > reach_m]
+    return top
 
 
 def slot_floors(rack: RackModel, seed: int = 0, spacing_m: float = 1.5e-3) -> FloatArray:

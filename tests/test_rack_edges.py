@@ -43,9 +43,7 @@ def capped(slots):
 
 def hidden_by(top, slots, reach_m):
     """The top less what is under caps in those slots."""
-    for slot in slots:
-        top = top[np.hypot(*(top[:, :2] - slot.center_m).T) > reach_m]
-    return top
+    return scenes.hidden_by(top, [slot.center_m for slot in slots], reach_m)
 
 
 @pytest.mark.parametrize("rack", [SOFT, MIXED], ids=lambda rack: rack.name)

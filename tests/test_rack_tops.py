@@ -44,17 +44,13 @@ def ribs(slope=0.0, sunk_m=0.0, shown=1.0):
     """What a camera aslant sees of the top between caps; but for the share `shown`, sunk as stray light sinks it."""
     top = scenes.rack_top(SOFT, spacing_m=0.6e-3)
     for behind_m in np.linspace(0, 10e-3, 5):
-        top = hidden_by(top, [(x, y + behind_m) for x, y in (slot.center_m for slot in SLOTS)])
+        top = scenes.hidden_by(top, [(x, y + behind_m) for x, y in (slot.center_m for slot in SLOTS)], 9e-3)
     rng = np.random.default_rng(0)
     patch = np.floor(top[:, :2] / 6e-3).astype(int) + 20
     top = top[rng.uniform(size=(40, 40))[patch[:, 0], patch[:, 1]] < 0.6]
     stray = rng.uniform(size=len(top)) > shown
     top[stray, 2] += slope * top[stray, 1] - sunk_m
     return transform_points(T_TRUE, top)
-
-
-def hidden_by(top, places):
-    return top[np.min([np.hypot(*(top[:, :2] - place).T) for place in places], axis=0) > 9.0e-3]
 
 
 def turned(x_deg, y_deg, up_m=0.0):

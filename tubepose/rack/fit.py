@@ -154,9 +154,10 @@ def refine(state: RoughFit, rack: RackModel) -> Fit:
 
 def _covariance(state: RoughFit) -> FloatArray:
     """Of the pose's error, shape (6, 6): that of the last round, and what it cannot know of."""
+    inflate = INFLATE if state.level is None else INFLATE_HELD
+    covariance = np.asarray(inflate @ state.covariance @ inflate + np.diag(FLOOR**2))
     if state.level is None:
-        return np.asarray(INFLATE @ state.covariance @ INFLATE + np.diag(FLOOR**2))
-    covariance = INFLATE_HELD @ state.covariance @ INFLATE_HELD + np.diag(FLOOR**2)
+        return covariance
     covariance[5, 5] += FLOOR_HELD_M**2
     # The height is that of ribs that may be seen at one end only: the level's error moves it at the centre.
     seen = at_the_top(state, state.rough_m)
@@ -164,7 +165,7 @@ def _covariance(state: RoughFit) -> FloatArray:
     lever = np.array([[1.0, 0], [0, 1], [-y, x]])
     level = np.ix_([0, 1, 5], [0, 1, 5])
     covariance[level] += lever @ state.level.covariance @ lever.T
-    return np.asarray(covariance)
+    return covariance
 
 
 def leveled(rough: RoughFit, level: Level) -> RoughFit:

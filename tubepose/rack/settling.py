@@ -47,44 +47,43 @@ def settled(
         rack: The rack.
         config: What a registration has to pass.
     """
-    fit, agreement = _judged(near_m, rough, rack, config)
+    best = _judged(near_m, rough, rack, config)
     for _ in range(SLOT_STEPS):
         # No step smooths what is rough, nor empties openings.
-        stray = agreement.in_slot > 2 * config.max_stray_share or agreement.rmse_m > config.max_inlier_rmse_m
-        if agreement.slot_margin >= 0 or stray:
+        seen = best.agreement
+        stray = seen.in_slot > 2 * config.max_stray_share or seen.rmse_m > config.max_inlier_rmse_m
+        if seen.slot_margin >= 0 or stray:
             break
-        T_step = translation([*agreement.step_m, 0.0])
-        near_m, rough = look_at(points_m, fit.T_camera_rack @ T_step, rack)
-        farther, there = _judged(near_m, rough, rack, config)
-        if there.evidence <= agreement.evidence:
+        T_step = translation([*seen.step_m, 0.0])
+        near_m, rough = look_at(points_m, best.fit.T_camera_rack @ T_step, rack)
+        farther = _judged(near_m, rough, rack, config)
+        if farther.agreement.evidence <= seen.evidence:
             break
-        fit, agreement = farther, there
-    return Registration(fit, agreement, contradiction(agreement, fit, rack, config))
+        best = farther
+    return best
 
 
-def _judged(near_m: FloatArray, rough: RoughFit, rack: RackModel, config: RackConfig) -> tuple[Fit, Agreement]:
+def _judged(near_m: FloatArray, rough: RoughFit, rack: RackModel, config: RackConfig) -> Registration:
     """The fine rounds, held level by the tops of what stands in the rack where hardly any of its own top is seen.
 
     Or where little is, and leans. Ribs that pass every test are believed where a rack that is held does not.
     """
     hopeless = rough.stray > HOPELESS_SHARE
-    free: tuple[Fit, Agreement] | None = None
+    free: Registration | None = None
     if hopeless or coverage(at_the_top(rough, rough.kept_m), rack) >= config.clear_seen:
-        free = _by_ribs(near_m, rough, rack, config)
-        if hopeless or free[1].coverage >= HIDDEN_SHARE:
+        free = _refined(near_m, rough, rack, config)
+        if hopeless or free.agreement.coverage >= HIDDEN_SHARE:
             return free
     level = level_by_tops(near_m, rough.kept_m, rough.T_camera_top, rack)
     if level is None:
-        return free or _by_ribs(near_m, rough, rack, config)
-    if free is not None and free[1].coverage >= config.clear_seen and not _leans(free[0], level, rack):
+        return free or _refined(near_m, rough, rack, config)
+    if free is not None and free.agreement.coverage >= config.clear_seen and not _leans(free.fit, level, rack):
         return free
-    held = refine(leveled(rough, level), rack)
-    seen = measure_agreement(near_m, held, rack, config)
-    if contradiction(seen, held, rack, config):
-        fit, alone = free or _by_ribs(near_m, rough, rack, config)
-        if not contradiction(alone, fit, rack, config):
-            return fit, alone
-    return held, seen
+    held = _refined(near_m, leveled(rough, level), rack, config)
+    if held.reason:
+        free = free or _refined(near_m, rough, rack, config)
+        return held if free.reason else free
+    return held
 
 
 def _leans(fit: Fit, level: Level, rack: RackModel) -> bool:
@@ -95,6 +94,7 @@ def _leans(fit: Fit, level: Level, rack: RackModel) -> bool:
     return bool(off > LEANS_SIGMAS**2)
 
 
-def _by_ribs(near_m: FloatArray, rough: RoughFit, rack: RackModel, config: RackConfig) -> tuple[Fit, Agreement]:
+def _refined(near_m: FloatArray, rough: RoughFit, rack: RackModel, config: RackConfig) -> Registration:
     fit = refine(rough, rack)
-    return fit, measure_agreement(near_m, fit, rack, config)
+    agreement = measure_agreement(near_m, fit, rack, config)
+    return Registration(fit, agreement, contradiction(agreement, fit, rack, config))

@@ -31,8 +31,8 @@ BIN_M = 1e-3
 LEAST_POINTS = 20
 LEAST_SHARE = 0.7
 POINTS_PER_SLOT = 240
-# Tubes stand apart: places farther from every slot's axis than this share of the distance to the next slot have no part
-# of a top, if they hang together. A plate has as many points there as above the slots.
+# Tubes stand apart: no part of a top is farther from the axes of all slots than this share of the distance to the next
+# slot. A plate has points there too, as close together as above the slots; with this share of them it is one.
 BETWEEN = 0.6
 PLATE_SHARE = 0.5
 AREA_STEP_M = 0.5e-3
