@@ -1,24 +1,22 @@
 """The rack's pose in six degrees of freedom, from its plane and from the edges of its ribs, openings and outline.
 
-Heights of points on the solid part give the plane. The edges give the rest: a point at the top's height must lie on the
-solid part, whose signed distance says how far off it is, less the blur of the sensor. Points on opposite edges of ribs
-push in opposite directions, so a blur that makes every rib look wider, or thinner, moves no pose.
-
-Points below the top are not used here: next to an edge they mix two depths, and lie on the side that the projector's
-shadow leaves. `Labels` has them as evidence all the same.
+What one round of it does is in `rounds`. Points below the top are not used here: next to an edge they mix two depths,
+and lie on the side that the projector's shadow leaves. `Labels` has them as evidence all the same.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
+import cv2
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from tubepose.labware import RackModel
 from tubepose.rack import kernels as kernels
+from tubepose.rack import rounds as rounds
 from tubepose.rack import view_kernels as view_kernels
 from tubepose.rack.field import TopField, top_field
+from tubepose.rack.rounds import WIDEST_M
 from tubepose.rack.tops import Level
 from tubepose.transforms import FloatArray, make_transform, translation
 
@@ -34,32 +32,20 @@ ROUNDS_M = (
 ROUGH_ROUNDS = 2
 ROUGH_POINTS = 4000
 FINE_POINTS = 10_000
-# With so many points so far from the solid part after the rough rounds, finer ones are of no use.
+# With so many points astray after the rough rounds, finer ones are of no use.
 HOPELESS_SHARE = 0.35
-STRAY_M = 1.2e-3
-# Where heights scatter more than a good sensor's, wider ones count; edges are looked for at least this near the top.
-WIDEST_M = 2.0e-3
+# Edges are looked for at least this near the top.
 EDGE_WINDOW_M = 1.0e-3
-# A pixel that is half on a rib is still at its height: edges seem that much farther out.
-EDGE_SHIFT_M = 0.2e-3
-# Share of pixels that say the wrong thing wherever they are: bounds what one of them can do.
-WRONG_SHARE = 0.05
 LEAST_POINTS = 20
 # Variance of what nothing is known of.
 UNKNOWN = 1e6
-# Points this far inside the solid part are on the plane; nearer to an edge, pixels mix two depths.
-INSIDE_M = 0.3e-3
+# Of a pose's six numbers those that the plane tells, and those that the edges tell.
+PLANE, EDGES = np.ix_([0, 1, 5], [0, 1, 5]), np.ix_([2, 3, 4], [2, 3, 4])
 # Points below this far are seen through the top: nearer ones may be mixed with it.
 THROUGH_M = 10e-3
-# The slots' distances are fitted with a blur that reaches from one rack's ribs to another's.
-STRETCH_ROUNDS = 3
-STRETCH_BLUR_M = 0.5e-3
 # How far beside a top points are looked at: a slot and its ribs.
 BESIDE_M = 30e-3
-# Neighbours share their depth's error: squares of this length count as one, if they have this many points. Light that
-# goes astray is alike over a slot and its ribs: what a pose's error is estimated from.
-SHARED_LENGTH_M = 3e-3
-FULL_SQUARE = 12
+# Light that goes astray is alike over a slot and its ribs: what a pose's error is estimated from.
 CLUSTER_M = 20e-3
 # What no number of points takes away: calibration, and shadows and hidden sides that are on the same side everywhere.
 FLOOR = np.array([5e-4, 3e-4, 2e-4, 6e-5, 6e-5, 6e-5])
@@ -163,8 +149,7 @@ def _covariance(state: RoughFit) -> FloatArray:
     seen = at_the_top(state, state.rough_m)
     x, y = seen.mean(axis=0) if len(seen) else np.zeros(2)
     lever = np.array([[1.0, 0], [0, 1], [-y, x]])
-    level = np.ix_([0, 1, 5], [0, 1, 5])
-    covariance[level] += lever @ state.level.covariance @ lever.T
+    covariance[PLANE] += lever @ state.level.covariance @ lever.T
     return covariance
 
 
@@ -199,73 +184,36 @@ def _step(
     """One round of plane and edges, in place; the last one tells their covariance."""
     T = state.T_camera_top
     window_m = max(EDGE_WINDOW_M, min(3 * state.scatter_m, float(widths_m[0])))
-    height_m = max(window_m, float(widths_m[0]))
-    seen = kernels.laid(points_m, T[:3, :3], T[:3, 3], height_m, *field.grid)
-    local, distance, _ = seen
+    held = state.level is not None
+    (plane, scatter_m, normal, scores), inside, (edges, outlines), stray = rounds.round_step(
+        points_m, T[:3, :3], T[:3, 3], window_m, blur_m, widths_m, held, *field.grid
+    )
     state.covariance = UNKNOWN * np.eye(6)
-    move = np.zeros(6)
-    inside = distance < -INSIDE_M
-    if inside.sum() >= LEAST_POINTS:
-        plane, edges = np.ix_([0, 1, 5], [0, 1, 5]), np.ix_([2, 3, 4], [2, 3, 4])
-        held = state.level is not None
-        move[[0, 1, 5]], state.covariance[plane], state.scatter_m = _plane(local[inside], widths_m, last, held)
-        move[[2, 3, 4]], state.covariance[edges] = _edges(seen, window_m, blur_m, last)
-        state.stray = float(np.mean(distance[np.abs(local[:, 2]) < window_m] > STRAY_M))
-    T_step = make_transform(Rotation.from_rotvec(move[:3]).as_matrix(), move[3:])
-    state.T_camera_top = state.T_camera_top @ T_step
+    if len(inside) < LEAST_POINTS:
+        return
+    if last:
+        state.covariance[PLANE] = _clustered(normal, scores, inside)
+        state.covariance[EDGES] = _clustered(*outlines)
+    state.scatter_m, state.stray = float(scatter_m), float(stray)
+    turn = np.asarray(cv2.Rodrigues(np.array([*plane[:2], edges[0]]))[0], float)
+    state.T_camera_top = np.asarray(T @ make_transform(turn, np.array([*edges[1:], plane[2]])))
 
 
 def _stretch(state: RoughFit, field: TopField) -> tuple[FloatArray, FloatArray]:
     """Stretch along x and y with which the template agrees best, and its standard deviations."""
-    xy = at_the_top(state, state.rough_m)
-    places = np.zeros((len(xy), 3))
-    moved = np.zeros(5)
-    covariance = np.eye(5)
-    for number in range(STRETCH_ROUNDS):
-        turn = np.array([[1.0, -moved[0]], [moved[0], 1.0]])
-        places[:, :2] = (xy - moved[1:3]) @ turn / (1 + moved[3:])
-        seen = kernels.laid(places, np.eye(3), np.zeros(3), np.inf, *field.grid)
-        if len(seen[0]) < LEAST_POINTS:
-            return np.zeros(2), np.full(2, np.inf)
-        step, covariance = _edges(seen, np.inf, STRETCH_BLUR_M, number == STRETCH_ROUNDS - 1, True)
-        moved = moved + step
-    return moved[3:], np.sqrt(np.diag(covariance))[3:]
-
-
-def _plane(points_m: FloatArray, widths_m: FloatArray, last: bool, held: bool) -> tuple[FloatArray, FloatArray, float]:
-    """Turns about x and y, and height, of the plane where heights are densest; their covariance; their scatter.
-
-    The heights that count are narrowed step by step, so that the plane ends on the mode and not on the mean: light that
-    goes astray sinks or lifts whole stretches of ribs. Places count alike, not points: a wall at the outline has most.
-    """
-    balance = 1 / np.maximum(kernels.square_counts(points_m, SHARED_LENGTH_M), FULL_SQUARE)
-    found, scatter_m, normal, scores = kernels.plane_steps(points_m, balance, widths_m, WIDEST_M, held)
-    return found, _clustered(normal, scores, points_m) if last else np.eye(3), float(scatter_m)
+    moved, edges = rounds.stretched(at_the_top(state, state.rough_m), *field.grid)
+    if len(edges[1]) < LEAST_POINTS:
+        return np.zeros(2), np.full(2, np.inf)
+    return np.asarray(moved[3:]), np.sqrt(np.diag(_clustered(*edges)))[3:]
 
 
 def _clustered(normal: FloatArray, scores: FloatArray, points_m: FloatArray) -> FloatArray:
     """Covariance of a fit whose residuals are alike within squares of `CLUSTER_M`, and independent between them."""
     if len(points_m) == 0:
         return UNKNOWN * np.eye(len(normal))
-    products, count = kernels.cluster_sums(points_m, scores, CLUSTER_M)
+    products, count = rounds.cluster_sums(points_m, scores, CLUSTER_M)
     inverse = np.linalg.inv(normal)
     return np.asarray(inverse @ products @ inverse * (count / max(count - len(normal), 1)))
-
-
-def _edges(
-    seen: tuple[FloatArray, FloatArray, FloatArray], window_m: float, blur_m: float, last: bool, stretch: bool = False
-) -> tuple[FloatArray, FloatArray]:
-    """Yaw, shift along x and y, and stretch along them if asked for, that put points on the solid part.
-
-    Of those whose heights are within the window: their places (N, 3), distances (N,) and gradients (N, 2).
-    One step of Fisher scoring, and the covariance of where steps end.
-    """
-    count = 5 if stretch else 3
-    information, scores, xy = kernels.edge_step(*seen, window_m, EDGE_SHIFT_M, blur_m, WRONG_SHARE, count)
-    information += np.diag([1e1, 1e5, 1e5, 1e1, 1e1][:count])
-    step = np.linalg.solve(information, scores.sum(axis=0))
-    step *= min(1.0, 1e-3 / max(float(np.abs(step[1:3]).max()), 1e-12))
-    return step, _clustered(information, scores, xy) if last else np.eye(count)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

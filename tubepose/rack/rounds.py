@@ -1,0 +1,244 @@
+"""One round of a rack's fit, compiled: the plane of its top, and its edges; see `kernels`.
+
+Heights of points on the solid part give the plane. The edges give the rest: a point at the top's height must lie on the
+solid part, whose signed distance says how far off it is, less the blur of the sensor. Points on opposite edges of ribs
+push in opposite directions, so a blur that makes every rib look wider, or thinner, moves no pose.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from tubepose.compiled import compiled, solved
+from tubepose.rack.kernels import laid
+
+# Where heights scatter more than a good sensor's, wider ones count.
+WIDEST_M = 2.0e-3
+# Points this far inside the solid part are on the plane; nearer to an edge, pixels mix two depths.
+INSIDE_M = 0.3e-3
+# Points of the top's height that lie this far from its solid part are astray.
+STRAY_M = 1.2e-3
+# A pixel that is half on a rib is still at its height: edges seem that much farther out.
+EDGE_SHIFT_M = 0.2e-3
+# Share of pixels that say the wrong thing wherever they are: bounds what one of them can do.
+WRONG_SHARE = 0.05
+# Neighbours share their depth's error: squares of this length count as one, if they have this many points.
+SHARED_LENGTH_M = 3e-3
+FULL_SQUARE = 12
+# The slots' distances are fitted with a blur that reaches from one rack's ribs to another's.
+STRETCH_ROUNDS = 3
+STRETCH_BLUR_M = 0.5e-3
+# No step shifts a pose by more.
+LONGEST_STEP_M = 1e-3
+# Bins that a median is counted in: it is exact to the range of values over this.
+MEDIAN_BINS = 2048
+# Bins per half window that the densest height is looked for in.
+MODE_BINS = 20
+
+
+@compiled
+def densest(values, window):
+    """Middle of the fullest bin within +-`window`, smoothed over its neighbours."""
+    bins = 2 * MODE_BINS
+    counts = np.zeros(bins)
+    for value in values:
+        place = math.floor((value + window) / window * MODE_BINS)
+        if 0 <= place < bins:
+            counts[place] += 1.0
+    best, most = 0, -1.0
+    for i in range(bins):
+        near = counts[i]
+        for k in (1, 2):
+            weight = 1.0 if k == 1 else 0.5
+            near += weight * ((counts[i - k] if i >= k else 0.0) + (counts[i + k] if i + k < bins else 0.0))
+        if near > most:
+            best, most = i, near
+    return -window + (best + 0.5) * window / MODE_BINS
+
+
+@compiled
+def median_size(values, limit):
+    """Median of the absolute values below a limit, counted in bins; the limit itself where there is none."""
+    counts = np.zeros(MEDIAN_BINS, np.intp)
+    total = 0
+    scale = MEDIAN_BINS / limit
+    for value in values:
+        size = abs(value)
+        if size < limit:
+            counts[min(int(size * scale), MEDIAN_BINS - 1)] += 1
+            total += 1
+    passed = 0
+    for i in range(MEDIAN_BINS):
+        if passed + counts[i] > 0 and 2 * (passed + counts[i]) >= total:
+            return (i + (0.5 * total - passed) / counts[i]) / scale
+        passed += counts[i]
+    return limit
+
+
+@compiled
+def square_counts(xy_m, side_m):
+    """For every place (N, 2 or more) the number of places in its square of a grid."""
+    low_x, low_y, high_x, high_y = 0, 0, 0, 0
+    cells = np.empty((len(xy_m), 2), np.intp)
+    for k in range(len(xy_m)):
+        i, j = math.floor(xy_m[k, 0] / side_m + 0.5), math.floor(xy_m[k, 1] / side_m + 0.5)
+        cells[k, 0], cells[k, 1] = i, j
+        low_x, low_y, high_x, high_y = min(low_x, i), min(low_y, j), max(high_x, i), max(high_y, j)
+    counts = np.zeros((high_x - low_x + 1, high_y - low_y + 1), np.intp)
+    for i, j in cells:
+        counts[i - low_x, j - low_y] += 1
+    found = np.empty(len(xy_m), np.intp)
+    for k in range(len(xy_m)):
+        found[k] = counts[cells[k, 0] - low_x, cells[k, 1] - low_y]
+    return found
+
+
+@compiled
+def cluster_sums(xy_m, scores, side_m):
+    """Products (M, M) of the sums of scores (N, M) over the squares of a grid, and how many squares have places."""
+    low_x, low_y, high_x, high_y = 0, 0, 0, 0
+    for k in range(len(xy_m)):
+        i, j = math.floor(xy_m[k, 0] / side_m), math.floor(xy_m[k, 1] / side_m)
+        low_x, low_y, high_x, high_y = min(low_x, i), min(low_y, j), max(high_x, i), max(high_y, j)
+    rows = high_y - low_y + 1
+    sums = np.zeros(((high_x - low_x + 1) * rows, scores.shape[1]))
+    filled = np.zeros(len(sums), np.bool_)
+    for k in range(len(xy_m)):
+        i, j = math.floor(xy_m[k, 0] / side_m), math.floor(xy_m[k, 1] / side_m)
+        cell = (i - low_x) * rows + j - low_y
+        filled[cell] = True
+        for m in range(scores.shape[1]):
+            sums[cell, m] += scores[k, m]
+    return sums.T @ sums, filled.sum()
+
+
+@compiled
+def plane_step(points_m, off_m, balance, reach_m, normal):
+    """One reweighted step of a plane: adds to its normal equations in place, and returns its right side (3,)."""
+    right = np.zeros(3)
+    for k in range(len(points_m)):
+        u = off_m[k] / reach_m
+        if abs(u) < 1.0:
+            weight = balance[k] * (1.0 - u * u) ** 2
+            d0, d1 = points_m[k, 1], -points_m[k, 0]
+            normal[0, 0] += weight * d0 * d0
+            normal[0, 1] += weight * d0 * d1
+            normal[0, 2] += weight * d0
+            normal[1, 1] += weight * d1 * d1
+            normal[1, 2] += weight * d1
+            normal[2, 2] += weight
+            right[0] += weight * off_m[k] * d0
+            right[1] += weight * off_m[k] * d1
+            right[2] += weight * off_m[k]
+    normal[1, 0], normal[2, 0], normal[2, 1] = normal[0, 1], normal[0, 2], normal[1, 2]
+    return right
+
+
+@compiled
+def plane_steps(points_m, balance, widths_m, widest_m, held):
+    """Plane of points (N, 3) where heights are densest, windows narrowed: turns about x, y and height; scatter.
+
+    Returns them with the last normal equations (3, 3) and the scores (N, 3) of the points where the steps ended. Where
+    the level is held, the height alone moves.
+    """
+    stiff = 1e9 if held else 1e-9
+    found = np.array([0.0, 0.0, densest(points_m[:, 2], widths_m[0])])
+    off, scores = np.empty(len(points_m)), np.zeros((len(points_m), 3))
+    scatter = widths_m[0]
+    normal = np.zeros((3, 3))
+    reach = scatter
+    for width in widths_m:
+        for k in range(len(points_m)):
+            off[k] = points_m[k, 2] - points_m[k, 1] * found[0] + points_m[k, 0] * found[1] - found[2]
+        scatter = 1.4826 * median_size(off, max(width, 2 * scatter))
+        reach = max(width, min(2 * scatter, widest_m))
+        normal = np.diag(np.array([stiff, stiff, 1e-6]))
+        found = found + solved(normal, plane_step(points_m, off, balance, reach, normal))
+    for k in range(len(points_m)):
+        u = off[k] / reach
+        if abs(u) < 1.0:
+            now = points_m[k, 2] - points_m[k, 1] * found[0] + points_m[k, 0] * found[1] - found[2]
+            score = balance[k] * (1.0 - u * u) ** 2 * now
+            scores[k, 0], scores[k, 1], scores[k, 2] = score * points_m[k, 1], -score * points_m[k, 0], score
+    return found, scatter, normal, scores
+
+
+@compiled
+def edge_step(points_m, distance_m, slope, window_m, shift_m, blur_m, wrong, count):
+    """Information (M, M) and scores (N, M) of edges about yaw, shift and, for M = 5, stretch; places (N, 2) of them.
+
+    Of points (K, 3) whose heights are within the window, with their distance to the solid part and its gradient.
+    """
+    information, design = np.zeros((count, count)), np.zeros(5)
+    scores, xy = np.empty((len(points_m), count)), np.empty((len(points_m), 2))
+    kept = 0
+    for k in range(len(points_m)):
+        eta = (shift_m - distance_m[k]) / blur_m
+        if not (abs(points_m[k, 2]) < window_m and abs(eta) < 6.0):
+            continue
+        plain = 1.0 / (1.0 + math.exp(-eta))
+        chance, rate = wrong + (1.0 - 2.0 * wrong) * plain, (1.0 - 2.0 * wrong) * plain * (1.0 - plain)
+        x, y = points_m[k, 0], points_m[k, 1]
+        gx, gy = slope[k, 0] / blur_m, slope[k, 1] / blur_m
+        design[0], design[1], design[2], design[3], design[4] = gy * x - gx * y, gx, gy, gx * x, gy * y
+        weight, score = rate * rate / (chance * (1.0 - chance)), rate / chance
+        for a in range(count):
+            scores[kept, a] = score * design[a]
+            for b in range(a, count):
+                information[a, b] += weight * design[a] * design[b]
+        xy[kept, 0], xy[kept, 1] = x, y
+        kept += 1
+    for a in range(count):
+        for b in range(a):
+            information[a, b] = information[b, a]
+    return information, scores[:kept], xy[:kept]
+
+
+@compiled
+def edge_move(local_m, distance_m, slope, window_m, blur_m, count):
+    """One step of Fisher scoring about yaw, shift and, for `count` 5, stretch; `edge_step` that it is made from."""
+    information, scores, xy = edge_step(local_m, distance_m, slope, window_m, EDGE_SHIFT_M, blur_m, WRONG_SHARE, count)
+    information = information + np.diag(np.array([1e1, 1e5, 1e5, 1e1, 1e1])[:count])
+    step = solved(information, scores.sum(axis=0))
+    return step * min(1.0, LONGEST_STEP_M / max(abs(step[1]), abs(step[2]), 1e-12)), (information, scores, xy)
+
+
+@compiled
+def round_step(points_m, rotation, origin_m, window_m, blur_m, widths_m, held, low_m, cell_m, shape, table):
+    """One round over points (N, 3), camera frame, for a top's frame.
+
+    The heights that count are narrowed step by step, so that the plane ends on the mode and not on the mean: light that
+    goes astray sinks or lifts whole stretches of ribs. Places count alike, not points: a wall at the outline has most.
+
+    Returns:
+        Plane: turns about x and y, and height; the scatter of heights; normal equations (3, 3), scores (K, 3) and
+        the points (K, 3). Edges: yaw and shifts (3,), and what `edge_step` gives. The share of points astray.
+    """
+    height_m = max(window_m, widths_m[0])
+    local, distance, slope = laid(points_m, rotation, origin_m, height_m, low_m, cell_m, shape, table)
+    inside = local[distance < -INSIDE_M]
+    balance = 1.0 / np.maximum(square_counts(inside, SHARED_LENGTH_M), FULL_SQUARE)
+    plane = plane_steps(inside, balance, widths_m, WIDEST_M, held)
+    astray, total = 0, 0
+    for k in range(len(local)):
+        if abs(local[k, 2]) < window_m:
+            total += 1
+            astray += distance[k] > STRAY_M
+    return plane, inside, edge_move(local, distance, slope, window_m, blur_m, 3), astray / total
+
+
+@compiled
+def stretched(xy_m, low_m, cell_m, shape, table):
+    """Yaw, shifts and stretch (5,) with which places (N, 2) agree best, and what `edge_step` gives there."""
+    moved, places = np.zeros(5), np.zeros((len(xy_m), 3))
+    for _ in range(STRETCH_ROUNDS):
+        for k in range(len(xy_m)):
+            x, y = xy_m[k, 0] - moved[1], xy_m[k, 1] - moved[2]
+            places[k, 0] = (x + moved[0] * y) / (1.0 + moved[3])
+            places[k, 1] = (y - moved[0] * x) / (1.0 + moved[4])
+        local, distance, slope = laid(places, np.eye(3), np.zeros(3), np.inf, low_m, cell_m, shape, table)
+        step, edges = edge_move(local, distance, slope, np.inf, STRETCH_BLUR_M, 5)
+        moved = moved + step
+    return moved, edges
