@@ -45,7 +45,7 @@ def thin(points_m: FloatArray, count: int) -> FloatArray:
     """At most `count` of the points of shape (N, 3), evenly spaced in their order (so always the same ones)."""
     if len(points_m) <= count:
         return points_m
-    return points_m[np.linspace(0, len(points_m) - 1, count).astype(np.intp)]
+    return np.take(points_m, np.linspace(0, len(points_m) - 1, count).astype(np.intp), axis=0)
 
 
 def point_spacing_m(points_m: FloatArray, sample: int = 500) -> float:

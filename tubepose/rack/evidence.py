@@ -18,14 +18,15 @@ EVIDENCE_BLUR_M = 0.4e-3
 # Distances that its likelihood is tabled over: beyond them it is what wrong pixels leave.
 CHANCE_STEP_M = 5e-6
 CHANCE_STEPS = 1600
-# Points that evidence is counted on where it is counted several times.
+# Points that evidence is counted on where it is counted several times, and at a first look.
 EVIDENCE_POINTS = 3000
+LOOK_POINTS = 1500
 
 
 def evidence_of(seen: Labels, rack: RackModel) -> tuple[float, float, tuple[float, float]]:
     """Evidence of the pose, and the most of any pose a slot farther with its step, in nats of all points."""
-    here, steps = _evidence_at(seen.solid_m[:, :2], rack, 1)
-    free_here, free_steps = _evidence_at(seen.free_m, rack, -1)
+    here, steps = _evidence_at(seen.solid_m[:, :2], rack, 1, EVIDENCE_POINTS)
+    free_here, free_steps = _evidence_at(seen.free_m, rack, -1, EVIDENCE_POINTS)
     beside = [
         (float(value), (float(x), float(y)))
         for value, (x, y) in zip(steps + free_steps, slot_steps_m(rack), strict=True)
@@ -33,12 +34,12 @@ def evidence_of(seen: Labels, rack: RackModel) -> tuple[float, float, tuple[floa
     return here + free_here, *max(beside, default=(-np.inf, (0.0, 0.0)))
 
 
-def _evidence_at(places_m: FloatArray, rack: RackModel, sign: int) -> tuple[float, FloatArray]:
+def _evidence_at(places_m: FloatArray, rack: RackModel, sign: int, count: int) -> tuple[float, FloatArray]:
     """Evidence of places (N, 2), frame of the top, that are solid (sign 1) or free (-1), here and a slot farther, (K,).
 
-    In nats of all points, from `EVIDENCE_POINTS` of them.
+    In nats of all points, from `count` of them at most.
     """
-    every = len(places_m) // EVIDENCE_POINTS + 1
+    every = len(places_m) // count + 1
     shifts = np.array([(0.0, 0.0), *slot_steps_m(rack)])
     chances = _log_chances(rack, sign)
     found = view_kernels.table_sums(places_m[::every].copy(), shifts, *top_field(rack).grid, chances, CHANCE_STEP_M)
@@ -50,7 +51,7 @@ def likelier_step_m(rough: RoughFit, rack: RackModel) -> FloatArray | None:
 
     Told by the points at the top's height alone: a first look, before much work is put into a pose.
     """
-    here, beside = _evidence_at(at_the_top(rough, rough.rough_m), rack, 1)
+    here, beside = _evidence_at(at_the_top(rough, rough.rough_m), rack, 1, LOOK_POINTS)
     return slot_steps_m(rack)[int(beside.argmax())] if len(beside) and beside.max() > here else None
 
 

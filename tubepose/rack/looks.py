@@ -15,8 +15,9 @@ from tubepose.transforms import FloatArray, translation
 SLOT_STEPS = 6
 # Steps that lead back to a place this near are of no use.
 NEAR_STEP_M = 4e-3
-# Beside a coarse place: its own error, and what lies outside of a top.
+# Beside a coarse place: its own error, and what lies outside of a top. So far from there no others are needed.
 NEAR_M = 0.06
+SAME_POINTS_M = 0.025
 
 
 def seen_near(points_m: FloatArray, T_camera_rack: FloatArray, rack: RackModel) -> FloatArray:
@@ -33,6 +34,7 @@ def seen_near(points_m: FloatArray, T_camera_rack: FloatArray, rack: RackModel) 
 def on_lattice(points_m: FloatArray, T_camera_rack: FloatArray, rack: RackModel) -> tuple[FloatArray, RoughFit]:
     """Points near a coarse pose, and a rough fit there or as many slots farther as a first look at it says."""
     near_m, rough = look_at(points_m, T_camera_rack, rack)
+    middle_m = rough.T_camera_top[:3, 3]
     been: list[FloatArray] = []
     for _ in range(SLOT_STEPS):
         step_m = likelier_step_m(rough, rack)
@@ -40,9 +42,14 @@ def on_lattice(points_m: FloatArray, T_camera_rack: FloatArray, rack: RackModel)
             break
         been.append(rough.T_camera_top[:3, 3])
         T_there = rack_frame(rough, rack) @ translation([*step_m, 0.0])
-        if any(np.linalg.norm(T_there @ [0, 0, rack.height_m, 1] - [*place, 1]) < NEAR_STEP_M for place in been):
+        there_m = top_frame(T_there, rack)[:3, 3]
+        if any(np.linalg.norm(there_m - place) < NEAR_STEP_M for place in been):
             break
-        near_m, rough = look_at(points_m, T_there, rack)
+        if np.linalg.norm(there_m - middle_m) < SAME_POINTS_M:
+            rough = roughly(near_m, T_there, rack)
+        else:
+            near_m, rough = look_at(points_m, T_there, rack)
+            middle_m = there_m
     return near_m, rough
 
 
