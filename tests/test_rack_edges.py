@@ -8,7 +8,7 @@ import scenes
 
 from tubepose.config import Config
 from tubepose.labware import load_rack, load_tube
-from tubepose.rack import RackStatus, edges, looks, register_rack, settling
+from tubepose.rack import RackStatus, agreement, edges, fit, looks, register_rack, settling
 from tubepose.rack.acceptance import too_coarse
 from tubepose.rack.field import top_field
 from tubepose.rack.fit import filled, refine
@@ -116,6 +116,28 @@ def test_openings_that_are_wider_than_the_racks_are_another_rack():
     pose = register(TOP, STEEL)
     assert pose.status is not RackStatus.OK
     assert "another rack" in pose.reason
+
+
+@pytest.mark.parametrize("share", [0.1, 0.2])
+def test_light_that_lifts_and_sinks_points_makes_the_plane_less_sure(share):
+    rng = np.random.default_rng(5)
+    noisy = TOP + rng.normal(0, 1e-4, TOP.shape) * [0, 0, 1]
+    astray = noisy + (rng.random(len(TOP)) < share)[:, None] * rng.choice([-2e-3, 2e-3], (len(TOP), 1)) * [0, 0, 1]
+    clean, lit = register(noisy), register(astray)
+    assert lit.status is RackStatus.OK, lit.reason
+    clean_std, lit_std = (np.sqrt(np.diag(pose.covariance)) for pose in (clean, lit))
+    expected = np.sqrt(1 + (share / fit.LIFTED_SHARE) ** 2)
+    # What the tubes' slots say of yaw and shift is as sure as before.
+    assert lit_std[[0, 1, 5]] / clean_std[[0, 1, 5]] == pytest.approx(expected, rel=0.25)
+    assert lit_std[[2, 3, 4]] / clean_std[[2, 3, 4]] == pytest.approx(1, rel=0.25)
+
+
+def test_evidence_is_compared_at_one_spacing():
+    seen = agreement.Agreement(evidence=100.0, spacing_m=0.5e-3)
+    assert seen.evidence_at(0.5e-3) == pytest.approx(100)
+    assert seen.evidence_at(1.0e-3) == pytest.approx(400)
+    assert seen.evidence_at(9e-3) == seen.evidence_at(1.5e-3) == pytest.approx(900)
+    assert agreement.Agreement().evidence_at(0.5e-3) == 0
 
 
 def test_the_covariance_holds_what_repeated_scans_do():

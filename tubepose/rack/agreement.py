@@ -83,6 +83,10 @@ class Agreement:
     outside: float = 0.0
     unseen: float = 0.0
 
+    def evidence_at(self, spacing_m: float) -> float:
+        """The evidence, had the points been measured to lie this far apart: to be compared with a fit that found so."""
+        return self.evidence * _alike(spacing_m) / _alike(self.spacing_m) if self.evidence else 0.0
+
 
 def measure_agreement(points_m: FloatArray, fit: Fit, rack: RackModel, config: RackConfig) -> Agreement:
     """Compare points (N, 3), camera frame, with a fit."""

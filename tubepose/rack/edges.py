@@ -131,7 +131,8 @@ def _likeliest(found: list[Registration], rack: RackModel, config: RackConfig) -
     found = sorted(found, key=lambda r: (bool(r.reason), -r.agreement.evidence))
     if len(found) < 2 or found[1].reason:
         return found[0] if found else None
-    best, next_best = (registration.agreement.evidence for registration in found[:2])
+    spacing_m = found[0].agreement.spacing_m
+    best, next_best = (registration.agreement.evidence_at(spacing_m) for registration in found[:2])
     if best >= config.min_rival_ratio * next_best:
         return found[0]
     reason = (

@@ -106,7 +106,8 @@ def _grown(
             # The line that is added must be seen half as well as the others: what is not seen adds evidence, too.
             lines = max(abs(side[0]) * grown.grid.columns, abs(side[1]) * grown.grid.rows) if grown.grid else 1
             least = before[1].agreement.coverage * (1 - 0.5 / lines)
-            if more.agreement.coverage > least and more.agreement.evidence > best[1].agreement.evidence:
+            seen = best[1].agreement
+            if more.agreement.coverage > least and more.agreement.evidence_at(seen.spacing_m) > seen.evidence:
                 best = grown, more
         if best is before:
             break

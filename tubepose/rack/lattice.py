@@ -75,7 +75,8 @@ def other_pitch(points_m: FloatArray, best: Registration, rack: RackModel, latti
             continue
         other = SlotLattice((float(pitch[0]), float(pitch[1])), lattice.slot)
         packed = other.rack(int(counts[1]), int(counts[0]), other.walls_mm(outline, counts))
-        evidence = register_at(points_m, best.fit.T_camera_rack, packed, config.rack).agreement.evidence
+        seen = register_at(points_m, best.fit.T_camera_rack, packed, config.rack).agreement
+        evidence = seen.evidence_at(best.agreement.spacing_m)
         if evidence > most:
             likeliest, most = pitch, evidence
     if np.allclose(likeliest, lattice.pitch_mm):
