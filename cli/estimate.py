@@ -132,6 +132,8 @@ def estimate(
                 else ""
             )
             rack_words = f"{row['status']}: {row['reason']}{others}"
+        if row["n_racks_detected"] > 1:
+            rack_words += f" ({row['n_racks_detected']} racks in view, one is answered for: that of the best score)"
         keys = ("session", "trial", "capture", "frame", "method")
         of = [e for e in tables.estimates if all(e[key] == row[key] for key in keys) and not e["seed"]]  # none, or 0
         by = f"{row['method']}: " if len(methods) > 1 else ""

@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from tubepose import __version__
-from tubepose.errors import TubePoseError
+from tubepose.errors import StoppedError, TubePoseError, is_interrupt
 from tubepose_cli import data, detector, labware
 from tubepose_cli.bench import bench
 from tubepose_cli.estimate import estimate
@@ -45,9 +45,16 @@ def main(
 
 
 def run() -> None:
-    """Entry point: an error that the user can correct is one line on stderr and exit 1; a wrong usage is exit 2."""
+    """Entry point: an error that the user can correct is one line on stderr and exit 1; a wrong usage is exit 2.
+
+    Ctrl-C is exit 130.
+    """
     try:
         app()
     except TubePoseError as problem:
         print(f"error: {problem}", file=sys.stderr)
-        sys.exit(1)
+        sys.exit(130 if isinstance(problem, StoppedError) else 1)
+    except SystemError as problem:
+        if not is_interrupt(problem):
+            raise
+        sys.exit(130)

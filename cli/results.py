@@ -37,8 +37,12 @@ def run_estimates(
     """Run jobs and write racks.csv, slots.csv, estimates.csv, timings.csv, run.json and overlays/ into `out`.
 
     `problems` are those from before, and `labware` what was used besides, for the record.
+
+    Raises:
+        StoppedError: The user stopped the run. What was done by then is written; nothing where nothing was done.
     """
     from tubepose.batch import run_jobs
+    from tubepose.errors import StoppedError
     from tubepose.provenance import pinned_threads, run_record
     from tubepose.records import ESTIMATE_COLUMNS, RACK_COLUMNS, SLOT_COLUMNS, TIMING_COLUMNS, to_table
     from tubepose.report.writing import make_folder, write_csv, write_json
@@ -56,6 +60,9 @@ def run_estimates(
             jobs, methods, detector_for, config, seeds=seeds, warm_up=warm_up, fail_fast=fail_fast,
             on_scene=draw, on_done=step,
         )  # fmt: skip
+    stopped = f"interrupted: {tables.done} of {len(jobs)} captures are done" if tables.done < len(jobs) else ""
+    if stopped and not tables.done:
+        raise StoppedError(f"{stopped}; no table is written to {out}")
     write_csv(out / "racks.csv", to_table(tables.racks, RACK_COLUMNS))
     write_csv(out / "slots.csv", to_table(tables.slots, SLOT_COLUMNS))
     write_csv(out / "estimates.csv", to_table(tables.estimates, ESTIMATE_COLUMNS))
@@ -68,10 +75,12 @@ def run_estimates(
         methods=list(methods),
         seeds=list(range(seeds)),
         threads=1,
-        problems=[*problems, *tables.problems],
+        problems=[*problems, *tables.problems, *([stopped] if stopped else [])],
         **more,
     )
     write_json(out / "run.json", record)
+    if stopped:
+        raise StoppedError(f"{stopped}, and in the tables in {out}")
     return tables
 
 

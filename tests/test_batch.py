@@ -43,7 +43,7 @@ class Recorded:
 
     name: str
     content: tuple[RgbdFrame, ...] = ()
-    problem: Exception | None = None
+    problem: BaseException | None = None
     path: Path = Path("captures/scan")
 
     def frames(self) -> Iterator[RgbdFrame]:
@@ -52,7 +52,7 @@ class Recorded:
             raise self.problem
 
 
-def job(name: str, *frames: RgbdFrame, problem: Exception | None = None, **more: Any) -> Job:
+def job(name: str, *frames: RgbdFrame, problem: BaseException | None = None, **more: Any) -> Job:
     return Job(Recorded(name, frames, problem), RACK, (TUBE,), **more)
 
 
@@ -83,6 +83,29 @@ def test_a_detector_that_cannot_work_is_a_problem_of_its_capture() -> None:
     tables = run_jobs([job("a", GOOD), job("b", GOOD)], ["upright"], lambda rack, tubes: Blind(), CONFIG, warm_up=True)
     assert tables.problems == ["a: no image", "b: no image"]
     assert tables.racks == []
+
+
+def in_compiled_code(problem: BaseException) -> SystemError:
+    """What becomes of an exception that arrives while compiled code runs."""
+    swallowed = SystemError("returned a result with an exception set")
+    swallowed.__cause__ = problem
+    return swallowed
+
+
+@pytest.mark.parametrize(
+    "stop", [KeyboardInterrupt(), in_compiled_code(KeyboardInterrupt())], ids=["python", "compiled"]
+)
+def test_ctrl_c_keeps_the_rows_of_what_was_done(stop: BaseException) -> None:
+    cut = job("cut", replace(GOOD, capture="cut"), problem=stop)
+    tables = run(job("good", GOOD), cut, job("later", replace(GOOD, capture="later")))
+    assert (tables.done, tables.problems) == (1, [])
+    for rows in (tables.racks, tables.slots, tables.estimates, tables.timings):
+        assert {row["capture"] for row in rows} == {"good"}
+
+
+def test_a_system_error_that_is_no_ctrl_c_is_raised() -> None:
+    with pytest.raises(SystemError):
+        run(job("good", GOOD, problem=in_compiled_code(ValueError())))
 
 
 def test_fail_fast_raises_the_first_problem() -> None:

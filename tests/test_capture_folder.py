@@ -406,6 +406,20 @@ def test_bad_capture_does_not_stop_the_others(tmp_path):
     assert "found 'parsec'" in outcome[1]
 
 
+def test_what_is_left_of_a_capture_is_told_of(tmp_path):
+    write_folder_capture(tmp_path / "whole", make_frame())
+    for name in ("lost/image.png", "capitals/DEPTH.PNG", "overview/image.png"):
+        (tmp_path / name).parent.mkdir()
+        (tmp_path / name).touch()
+    write_folder_capture(tmp_path / "overview" / "inside", make_frame())
+    (tmp_path / "empty").mkdir()
+    captures = {capture.name: capture for capture in open_captures(tmp_path)}
+    assert list(captures) == ["capitals", "lost", "overview/inside", "whole"]
+    for name, word in (("lost", "image.png"), ("capitals", "DEPTH.PNG")):
+        with pytest.raises(CaptureError, match=f"{name}: no capture: {word} without cloud.ply, depth.png or"):
+            list(captures[name].frames())
+
+
 @pytest.mark.parametrize("suffix", [".bag", ".zdf", ".praw", ".db3", ".ptx", ".pcd"])
 def test_other_formats_say_how_to_convert(tmp_path, suffix):
     (tmp_path / f"scan{suffix}").write_bytes(b"")

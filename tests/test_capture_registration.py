@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tubepose.capture import CameraIntrinsics, estimate_intrinsics, project_cloud
-from tubepose.capture.registration import clean_cloud
+from tubepose.capture.registration import clean_cloud, is_mirrored
 from tubepose.transforms import axis_rotation, make_transform, transform_points
 
 CAMERA = CameraIntrinsics(width=20, height=10, fx=30.0, fy=31.0, cx=9.5, cy=4.5)
@@ -64,6 +64,22 @@ def test_cloud_that_is_no_pinhole_image_has_no_intrinsics():
     assert estimate_intrinsics(rng.permutation(cloud.reshape(-1, 3)).reshape(10, 20, 3)) is None
     assert estimate_intrinsics(np.full((10, 20, 3), np.nan)) is None
     assert estimate_intrinsics(np.tile([0.0, 0.0, 1.0], (10, 20, 1))) is None
+
+
+@pytest.mark.parametrize("signs", [(1, 1), (-1, 1), (1, -1), (-1, -1)])
+def test_a_cloud_in_a_mirror_is_told_from_one_that_is_turned(signs):
+    camera = CameraIntrinsics(200, 160, 300.0, 310.0, 101.0, 83.0)
+    cloud = camera.backproject(np.random.default_rng(2).uniform(0.5, 1.5, (160, 200)))
+    cloud[::3, ::5] = np.nan
+    assert is_mirrored(cloud * [*signs, 1]) == (signs[0] * signs[1] < 0)
+    assert not is_mirrored(np.random.default_rng(3).permutation(cloud.reshape(-1, 3)).reshape(cloud.shape))
+    assert not is_mirrored(np.full((160, 200, 3), np.nan))
+
+
+@pytest.mark.parametrize("mark", [3.4e38, -1e30, 1e7])
+def test_a_number_that_is_no_distance_marks_a_missing_point(mark):
+    cleaned = clean_cloud(np.array([[1.0, 2, 3], [mark, 0, 1], [mark, mark, mark]], np.float32), 1.0)
+    assert np.isfinite(cleaned).all(axis=1).tolist() == [True, False, False]
 
 
 @pytest.mark.parametrize("scale", [1.0, 1e-3])

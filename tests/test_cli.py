@@ -20,6 +20,7 @@ from commands import Ended, tubepose
 from conftest import SMALL_RACK, SMALL_TUBES
 from onnx import TensorProto, helper, numpy_helper
 
+from tubepose import batch
 from tubepose.capture.mcap_writing import write_mcap
 from tubepose.capture.source import open_captures
 from tubepose.config import Config
@@ -338,6 +339,31 @@ def test_fail_fast_ends_with_the_first_bad_capture(damaged: Path, tmp_path: Path
     ended = tubepose("estimate", damaged, *KNOWN, "--no-overlays", "--fail-fast", "--out", tmp_path / "out")
     one_error(ended, "b-cut.mcap: truncated")
     assert digests(tmp_path) == {}
+
+
+@pytest.mark.parametrize(("after", "words"), [(0, "no table is written"), (1, "and in the tables")])
+def test_ctrl_c_is_one_line_and_what_was_done_is_written(
+    after: int, words: str, small_session: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    prepare, asked = batch.prepare_scene, []
+
+    def stopped(*args: Any) -> Any:
+        if len(asked) == after:
+            raise KeyboardInterrupt
+        asked.append(args[0].capture)
+        return prepare(*args)
+
+    monkeypatch.setattr(batch, "prepare_scene", stopped)
+    ended = tubepose("estimate", small_session, "--no-overlays", "--out", tmp_path / "out")
+    (line,) = ended.errors
+    assert ended.code == 130
+    assert line.startswith(f"error: interrupted: {after} of ")
+    assert words in line
+    if after:
+        assert set(table(tmp_path / "out" / "racks.csv")["capture"]) == set(asked)
+        assert "interrupted: 1 of" in json.loads((tmp_path / "out" / "run.json").read_text())["problems"][0]
+    else:
+        assert digests(tmp_path) == {}
 
 
 @pytest.mark.parametrize("command", ["estimate", "bench"])

@@ -447,6 +447,7 @@ def test_no_length_is_infinite(tmp_path, value):
         ("chen2023-soft-5x10", {"height_mm": True}, "height_mm: expected no yes or no"),
         ("chen2023-soft-5x10", {"outline_mm": [True, 90]}, "outline_mm: expected no yes or no"),
         ("chen2023-tube-2", {"classes": ["rack"]}, "'rack' is a detector's word for racks"),
+        ("chen2023-tube-2", {"name": "rack"}, "name: 'rack' is a detector's word for racks"),
         ("chen2023-tube-2", {"name": "all"}, "is a word of the tables"),
         ("chen2023-tube-2", {"name": "NaN"}, "is a word of the tables"),
         ("chen2023-tube-2", {"classes": "red-cap"}, r"classes: expected a list in brackets"),

@@ -15,7 +15,7 @@ from tubepose.capture.session import Session, SlotHint, Trial
 from tubepose.capture.source import Capture, open_captures
 from tubepose.config import Config
 from tubepose.detection import Detector
-from tubepose.errors import CaptureError, TubePoseError, kept
+from tubepose.errors import CaptureError, TubePoseError, is_interrupt, kept
 from tubepose.labware import Labware, RackModel, TubeModel
 from tubepose.pipeline import DEFAULT_METHOD, STOCHASTIC, Scene, StageTime, TubeEstimate, estimate_tubes, prepare_scene
 from tubepose.rack import RackPose, RackStatus
@@ -92,6 +92,7 @@ class Tables:
         timings: One per timed stage instance.
         labware: Every rack and tube that was looked for, by name.
         problems: One line per capture that could not be finished.
+        done: How many captures were finished or failed: all of them, but where the user stops the batch.
     """
 
     racks: list[Row] = field(default_factory=list)
@@ -100,6 +101,16 @@ class Tables:
     timings: list[Row] = field(default_factory=list)
     labware: dict[str, Labware] = field(default_factory=dict)
     problems: list[str] = field(default_factory=list)
+    done: int = 0
+
+    def lengths(self) -> tuple[int, ...]:
+        """How many rows there are, table by table."""
+        return tuple(len(rows) for rows in (self.racks, self.slots, self.estimates, self.timings))
+
+    def cut(self, lengths: tuple[int, ...]) -> None:
+        """Leave out the rows that came after there were so many."""
+        for rows, length in zip((self.racks, self.slots, self.estimates, self.timings), lengths, strict=True):
+            del rows[length:]
 
 
 def session_jobs(session: Session, *, fail_fast: bool = False) -> tuple[list[Job], list[str]]:
@@ -141,7 +152,7 @@ def run_jobs(
     on_scene: Callable[[Job, Scene, tuple[TubeEstimate, ...]], None] | None = None,
     on_done: Callable[[], None] | None = None,
 ) -> Tables:
-    """Run the methods on every frame of every job.
+    """Run the methods on every frame of every job, until the user stops it: rows of captures that are done are kept.
 
     Args:
         jobs: What to run.
@@ -155,16 +166,29 @@ def run_jobs(
         on_done: Called after each job (progress).
     """
     tables, warmed = Tables(), 0
+
+    def run(job: Job | UnnamedJob) -> None:
+        nonlocal warm_up, warmed
+        for named, frame, load_ms in _named_frames(job, methods, tables):
+            if warm_up:
+                warm = Tables()
+                _run_frame(named, frame, methods, detector_for, config, seeds, warm, tables.timings)
+                warmed += 1
+                warm_up = not warm.estimates and warmed < MOST_WARMED  # a frame without tubes warms half of it
+            load = StageTime("load", "all", "", None, load_ms)
+            _run_frame(named, frame, methods, detector_for, config, seeds, tables, None, load, on_scene)
+
     for job in jobs:
-        with kept(None if fail_fast else tables.problems, partial(_one_line, job)):
-            for named, frame, load_ms in _named_frames(job, methods, tables):
-                if warm_up:
-                    warm = Tables()
-                    _run_frame(named, frame, methods, detector_for, config, seeds, warm, tables.timings)
-                    warmed += 1
-                    warm_up = not warm.estimates and warmed < MOST_WARMED  # a frame without tubes warms half of it
-                load = StageTime("load", "all", "", None, load_ms)
-                _run_frame(named, frame, methods, detector_for, config, seeds, tables, None, load, on_scene)
+        before = tables.lengths()
+        try:
+            with kept(None if fail_fast else tables.problems, partial(_one_line, job)):
+                run(job)
+        except (KeyboardInterrupt, SystemError) as problem:
+            if not is_interrupt(problem):
+                raise
+            tables.cut(before)
+            break
+        tables.done += 1
         if on_done is not None:
             on_done()
     return tables

@@ -42,6 +42,17 @@ class ConfigError(TubePoseError):
     """A configuration file or an option is wrong."""
 
 
+class StoppedError(TubePoseError):
+    """The user stopped a batch (Ctrl-C); what was done by then is kept."""
+
+
+def is_interrupt(problem: BaseException | None) -> bool:
+    """Whether an exception is Ctrl-C, or what compiled code makes of one."""
+    if isinstance(problem, SystemError):
+        return is_interrupt(problem.__cause__ or problem.__context__)
+    return isinstance(problem, KeyboardInterrupt)
+
+
 @contextmanager
 def kept(problems: list[str] | None, words: Callable[[TubePoseError], str] = str) -> Iterator[None]:
     """Where a batch goes on: an error inside is one more line of `problems`; it is raised if that is None."""

@@ -24,7 +24,7 @@ RACK_COVARIANCE_COLUMNS = upper_half(RACK_COVARIANCE_AXES)
 RACK_COLUMNS = (
     "session", "trial", "capture", "frame", "timestamp_ns", "method", "rack", "status", "reason", "ambiguous",
     "resolved_by", "hint_note", "turn_margin_m", "inlier_rmse_m", "fitness", "in_slot_share", "coverage", "spacing_m",
-    "level_tops", "n_tubes_detected", "box_source", "box_score", "box_note", *POSE_COLUMNS,
+    "level_tops", "n_racks_detected", "n_tubes_detected", "box_source", "box_score", "box_note", *POSE_COLUMNS,
     "named_by_margin", *RACK_COVARIANCE_COLUMNS,
 )  # fmt: skip
 SLOT_COLUMNS = (
@@ -57,7 +57,7 @@ TIMING_COLUMNS = (
     "duration_ms",
     "warmup",
 )
-_WHOLE = ("timestamp_ns", "seed", "n_tubes_detected")
+_WHOLE = ("timestamp_ns", "seed", "n_racks_detected", "n_tubes_detected")
 
 
 def to_table(rows: Sequence[Row], columns: Sequence[str]) -> pd.DataFrame:
@@ -80,6 +80,7 @@ def rack_row(scene: Scene) -> Row:
     box = best_rack(scene.detections)
     return {
         "rack": scene.rack.name,
+        "n_racks_detected": sum(detection.is_rack for detection in scene.detections),
         "n_tubes_detected": sum(not detection.is_rack for detection in scene.detections),
         "box_source": box.source if box is not None else None,
         "box_score": box.score if box is not None else float("nan"),

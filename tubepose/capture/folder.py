@@ -19,6 +19,9 @@ from tubepose.errors import CaptureError
 from tubepose.labware.reading import read_yaml, validate
 from tubepose.transforms import FloatArray
 
+# Names of files that are told.
+MOST_TOLD = 3
+
 
 @dataclass(frozen=True, slots=True)
 class FolderCapture:
@@ -118,6 +121,12 @@ def is_capture_folder(path: Path) -> bool:
     return any((path / name).is_file() for name in (CAPTURE_FILE, CLOUD_FILE, DEPTH_FILE))
 
 
+def is_remains(path: Path) -> bool:
+    """True for a folder with a file of a capture, its name in capitals or not."""
+    usual = {CAPTURE_FILE, CLOUD_FILE, DEPTH_FILE, *IMAGE_FILES}
+    return any(entry.name.casefold() in usual and entry.is_file() for entry in path.iterdir())
+
+
 def _described(folder: Path) -> CaptureFile:
     """What `capture.yaml` says; files that it does not name are looked for under their usual names."""
     where = folder / CAPTURE_FILE
@@ -133,6 +142,11 @@ def _described(folder: Path) -> CaptureFile:
 
 def _guessed(folder: Path) -> CaptureFile:
     files = _usual_files(folder)
+    if "cloud" not in files and "depth" not in files:
+        there = ", ".join(sorted(entry.name for entry in folder.iterdir())[:MOST_TOLD])
+        raise CaptureError(
+            f"{folder}: no capture: {there} without {CLOUD_FILE}, {DEPTH_FILE} or {CAPTURE_FILE} beside it"
+        )
     if "cloud" not in files:
         raise CaptureError(
             f"{folder}: {DEPTH_FILE} without {CAPTURE_FILE}; write one with 'unit: mm' (or depth_scale_m) and "

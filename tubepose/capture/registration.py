@@ -19,17 +19,25 @@ _MAX_RESIDUAL_PX = 1.0
 _MIN_POINTS = 100
 
 
+MIRROR_STEP = 8
+"""Every so many pixels tell a mirrored cloud."""
+FARTHEST_M = 1e4
+"""No sensor of racks sees as far: numbers like this mark a missing point."""
+
+
 def clean_cloud(xyz: ArrayLike, metres_per_unit: float) -> FloatArray:
     """Coordinates in metres, with NaN for every invalid point.
 
-    Sensors mark a missing point by NaN (Zivid, ROS) or by (0, 0, 0) (PhoXi); both come out as NaN.
+    Sensors mark a missing point by NaN (Zivid, ROS), by (0, 0, 0) (PhoXi) or by a number that is no distance; all come
+    out as NaN.
 
     Args:
         xyz: Array of shape (..., 3) in the source's unit.
         metres_per_unit: 1 for metres, 0.001 for millimetres.
     """
     points = np.array(xyz, dtype=np.float64)
-    invalid = ~np.isfinite(points).all(axis=-1) | (points == 0).all(axis=-1)
+    with np.errstate(invalid="ignore"):  # NaN is no distance either
+        invalid = ~(np.abs(points) * metres_per_unit < FARTHEST_M).all(axis=-1) | (points == 0).all(axis=-1)
     points *= metres_per_unit
     points[invalid] = np.nan
     return points
@@ -82,26 +90,41 @@ def estimate_intrinsics(cloud_m: FloatArray) -> CameraIntrinsics | None:
         The intrinsics, or None where the cloud is no pinhole image: fewer than 100 points in front of the camera,
         points on one line of sight, or an RMS residual above 1 px along u or v.
     """
-    height, width = cloud_m.shape[:2]
+    lines = _fit_lines(cloud_m)
+    if lines is None or min(lines[0][0], lines[1][0]) <= 0:
+        return None
+    (fx, cx), (fy, cy) = lines
+    return CameraIntrinsics(cloud_m.shape[1], cloud_m.shape[0], fx, fy, cx, cy)
+
+
+def is_mirrored(cloud_m: FloatArray) -> bool:
+    """Whether an organised cloud (H, W, 3) is a camera's view in a mirror: x or y, not both, run against its pixels.
+
+    Some pixels of it are looked at. A cloud that is turned with its pixels, or that is no camera's, is not mirrored.
+    """
+    lines = _fit_lines(cloud_m[::MIRROR_STEP, ::MIRROR_STEP])
+    return lines is not None and lines[0][0] * lines[1][0] < 0
+
+
+def _fit_lines(cloud_m: FloatArray) -> tuple[tuple[float, float], tuple[float, float]] | None:
+    """Focal length and principal point along u and along v, pixels; a length is negative where an axis is turned."""
     v, u = np.nonzero(np.isfinite(cloud_m).all(axis=-1) & (np.nan_to_num(cloud_m[..., 2]) > 0))
     if len(u) < _MIN_POINTS:
         return None
     points = cloud_m[v, u]
     horizontal = _fit_line(points[:, 0] / points[:, 2], u)
     vertical = _fit_line(points[:, 1] / points[:, 2], v)
-    if horizontal is None or vertical is None:
-        return None
-    return CameraIntrinsics(width, height, horizontal[0], vertical[0], horizontal[1], vertical[1])
+    return None if horizontal is None or vertical is None else (horizontal, vertical)
 
 
 def _fit_line(tangent: FloatArray, pixel: NDArray[np.intp]) -> tuple[float, float] | None:
-    """Focal length and principal point of one axis, pixels; None where the fit is no camera."""
+    """Focal length, which may be negative, and principal point of one axis, pixels; None where the fit is no camera."""
     t, p = tangent - tangent.mean(), pixel - pixel.mean()
     spread = float(t @ t)
     if spread <= 0:
         return None
     focal = float(t @ p) / spread
     rms = float(np.sqrt(np.mean((p - focal * t) ** 2)))
-    if focal <= 0 or rms > _MAX_RESIDUAL_PX:
+    if focal == 0 or rms > _MAX_RESIDUAL_PX:
         return None
     return focal, float(pixel.mean() - focal * tangent.mean())

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Literal, Protocol
 
 from tubepose.capture.description import Unit
-from tubepose.capture.folder import FolderCapture, PlyCapture, is_capture_folder
+from tubepose.capture.folder import FolderCapture, PlyCapture, is_capture_folder, is_remains
 from tubepose.capture.frame import RgbdFrame
 from tubepose.capture.mcap import McapCapture
 from tubepose.capture.topics import TopicChoice
@@ -148,7 +148,9 @@ def _unit(unit: str | None) -> Unit | None:
 
 
 def _walk(folder: Path, inside: frozenset[Path] = frozenset()) -> Iterator[Path]:
-    """Capture folders and files below a folder, sorted; a capture folder is not searched further.
+    """Capture folders and files below a folder, sorted; a capture folder is searched no further.
+
+    A folder with nothing below it but some file of a capture is one that has lost the others.
 
     A link to a folder that it lies in leads nowhere new.
     """
@@ -159,7 +161,13 @@ def _walk(folder: Path, inside: frozenset[Path] = frozenset()) -> Iterator[Path]
         if not entry.is_dir() or is_capture_folder(entry):
             yield entry
         elif entry.resolve() not in inside:
-            yield from _walk(entry, inside)
+            below = list(_walk(entry, inside))
+            lost = is_remains(entry) and not any(place.is_dir() or _is_known(place) for place in below)
+            yield from [entry] if lost else below
+
+
+def _is_known(path: Path) -> bool:
+    return path.suffix.lower() in (".ply", ".mcap", *_CONVERT)
 
 
 def _names(root: Path, places: list[Path]) -> list[str]:

@@ -139,8 +139,9 @@ class TubeModel(Definition):
 
     @model_validator(mode="after")
     def _check(self) -> TubeModel:
-        if RACK_CLASS in self.classes:
-            raise ValueError(f"classes: '{RACK_CLASS}' is a detector's word for racks; give words for this tube")
+        if RACK_CLASS in (self.name, *self.classes):
+            key = "classes" if RACK_CLASS in self.classes else "name"
+            raise ValueError(f"{key}: '{RACK_CLASS}' is a detector's word for racks; give words for this tube")
         if self.body.height_mm < LEAST_TUBE_MM:
             high = self.body.height_mm
             raise ValueError(f"a tube is {LEAST_TUBE_MM:g} mm high or more, found height_mm {high}: is it in metres?")
