@@ -25,6 +25,11 @@ def test_a_good_tube_has_no_reason():
 @pytest.mark.parametrize(
     ("changed", "words"),
     [
+        ({"sectors": 0.31, "spacing_m": 1.0e-3}, "31% of the top's circle seen, at least 40% expected"),
+        (
+            {"sectors": 0.31, "spacing_m": 1.7e-3},
+            "the points on its top lie 1.7 mm apart: too coarse to tell where its circle ends, 1.3 mm or less expected",
+        ),
         ({"sectors": 0.31}, "31% of the top's circle seen, at least 40% expected"),
         (
             {"high_m": 5e-3},

@@ -16,8 +16,10 @@ from tubepose.profile.floor import SETTLED_MM, settle_floor
 from tubepose.profile.kernels import grouped
 from tubepose.profile.leftovers import Leftover, find_leftovers
 from tubepose.profile.measure import Measured, measure_tops
+from tubepose.profile.plane import top_spacing_m
 from tubepose.profile.posterior import FEW_SAMPLES, Evidence, Posterior, combine, evidence, per_model
 from tubepose.profile.standing import Standing, gather_standing
+from tubepose.profile.tops import top_radius_m
 from tubepose.profile.verdict import rejection, score
 from tubepose.profile.wall import wall_evidence
 from tubepose.transforms import FloatArray, axis_rotations
@@ -211,6 +213,7 @@ def _poses(
         "tilt_std_rad": tilt_std,
         "looked_at": (is_open == 0) | np.isfinite(circles.widening_m),
         "runner_up": tops.runner_up / tops.support,
+        "spacing_m": top_spacing_m(measured.planes, per_model(models, top_radius_m)),
     }
     columns = [values.tolist() for values in verdicts.values()]
     found = []

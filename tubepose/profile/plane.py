@@ -89,6 +89,12 @@ def fit_top_planes(
     )
 
 
+def top_spacing_m(planes: TopPlanes, radius_m: FloatArray) -> FloatArray:
+    """How far apart the points of tops of these radii (T,) lie, shape (T,), metres; NaN without a plane."""
+    area_m2 = np.pi * np.maximum(radius_m - EDGE_M, 0.0) ** 2
+    return np.where(np.isfinite(planes.height_m), np.sqrt(area_m2 / np.maximum(planes.n_points, 1)), np.nan)
+
+
 def _median_per_label(label: NDArray[np.intp], values: FloatArray, default: FloatArray) -> FloatArray:
     """Median of the values of each label, the default without any; shape (T,)."""
     order = np.lexsort((values, label))

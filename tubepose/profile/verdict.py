@@ -7,6 +7,9 @@ import numpy as np
 from tubepose.config import ProfileConfig
 from tubepose.labware import RackModel, TubeModel
 
+COARSE_M = 1.3e-3
+"""Where the circle of a top is not seen though points that lie farther apart than this are on it, they are too few."""
+
 
 def rejection(
     *,
@@ -20,6 +23,7 @@ def rejection(
     config: ProfileConfig,
     looked_at: bool = True,
     runner_up: float = 0.0,
+    spacing_m: float = float("nan"),
 ) -> str:
     """Why a pose cannot be believed; empty if it can.
 
@@ -34,12 +38,18 @@ def rejection(
         config: Limits.
         looked_at: Whether there were pixels to look at an open rim in.
         runner_up: Support of the next best type over that of this one.
+        spacing_m: How far apart the points on a closed top lie, metres; NaN for an open one.
     """
     if runner_up > config.max_runner_up:
         return f"another of the given types fits its top as well as {tube.name} ({runner_up:.0%} of its support)"
     if not looked_at:
         return "an open rim is measured in the image, and this cloud has no pixels"
     if sectors < config.min_sectors:
+        if spacing_m > COARSE_M:
+            return (
+                f"the points on its top lie {spacing_m * 1e3:.1f} mm apart: too coarse to tell where its circle ends, "
+                f"{COARSE_M * 1e3:.1f} mm or less expected"
+            )
         return f"{sectors:.0%} of the top's circle seen, at least {config.min_sectors:.0%} expected"
     if abs(high_m) > config.max_height_error_m:
         return (

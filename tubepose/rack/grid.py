@@ -39,6 +39,10 @@ STANDING_M = (5e-3, 0.15)
 MOST_BESIDE = 0.05
 # Lines of slots that may be hidden, and the sides that they are looked for on.
 MOST_GROWTH = 3
+# A line that is there is seen this well at least, as a share of how well the others are, and brings this share of the
+# evidence that they bring on average: edges of the top look like a third of a line, and bring a little.
+SEEN_SHARE = 1 / 3
+GROWTH_SHARE = 0.25
 SIDES = ((1, 0), (-1, 0), (0, 1), (0, -1))
 MOST_CELLS = 1_000_000
 
@@ -99,15 +103,17 @@ def _grown(
     """The registration, with a row or column more on any side as long as that explains more: tubes hide whole rows."""
     best = rack, register_at(points_m, T_camera_rack, rack, config.rack)
     for _ in range(MOST_GROWTH):
-        before = best
+        before, seen = best, best[1].agreement
         for side in SIDES:
             grown, T_more = _with_line(before[0], before[1].fit.T_camera_rack, np.array(side), lattice)
             more = register_at(points_m, T_more, grown, config.rack)
             # The line that is added must be seen half as well as the others: what is not seen adds evidence, too.
             lines = max(abs(side[0]) * grown.grid.columns, abs(side[1]) * grown.grid.rows) if grown.grid else 1
-            least = before[1].agreement.coverage * (1 - 0.5 / lines)
-            seen = best[1].agreement
-            if more.agreement.coverage > least and more.agreement.evidence_at(seen.spacing_m) > seen.evidence:
+            if more.agreement.coverage <= seen.coverage * (1 - (1 - SEEN_SHARE) / lines):
+                continue
+            evidence = more.agreement.evidence_at(seen.spacing_m)
+            least = seen.evidence * (1 + GROWTH_SHARE / max(lines - 1, 1))
+            if evidence > max(least, best[1].agreement.evidence_at(seen.spacing_m)):
                 best = grown, more
         if best is before:
             break

@@ -22,6 +22,8 @@ PITCH_SHARES = (
     0.5, 2 / 3, 0.75, 0.8, 0.85, 0.89, 0.92, 0.94, 0.96, 0.975, 1.025, 1.04, 1.06, 1.08, 1.12, 1.17, 1.25, 1.5
 )  # fmt: skip
 OTHER_PITCH = 1.05
+# No top ends with its outer openings: an outline that is measured a little too large has no row more.
+LEAST_WALL_MM = 1.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,7 +72,7 @@ def other_pitch(points_m: FloatArray, best: Registration, rack: RackModel, latti
     for axis, share in product(range(2), PITCH_SHARES):
         pitch = np.array(lattice.pitch_mm)
         pitch[axis] *= share
-        counts = np.floor((outline - size) / pitch + 1e-6).astype(np.intp) + 1
+        counts = np.floor((outline - size - 2 * LEAST_WALL_MM) / pitch).astype(np.intp) + 1
         if np.any(pitch <= size) or not countable(counts):
             continue
         other = SlotLattice((float(pitch[0]), float(pitch[1])), lattice.slot)

@@ -27,8 +27,9 @@ WRONG_SHARE = 0.05
 # Neighbours share their depth's error: squares of this length count as one, if they have this many points.
 SHARED_LENGTH_M = 3e-3
 FULL_SQUARE = 12
-# The slots' distances are fitted with a blur that reaches from one rack's ribs to another's.
-STRETCH_ROUNDS = 3
+# The slots' distances are fitted with a blur that reaches from one rack's ribs to another's, until they settle.
+STRETCH_ROUNDS = 20
+SETTLED_STRETCH = 2e-4
 STRETCH_BLUR_M = 0.5e-3
 # No step shifts a pose by more.
 LONGEST_STEP_M = 1e-3
@@ -241,4 +242,6 @@ def stretched(xy_m, low_m, cell_m, shape, table):
         local, distance, slope = laid(places, np.eye(3), np.zeros(3), np.inf, low_m, cell_m, shape, table)
         step, edges = edge_move(local, distance, slope, np.inf, STRETCH_BLUR_M, 5)
         moved = moved + step
+        if max(abs(step[3]), abs(step[4])) < SETTLED_STRETCH:
+            break
     return moved, edges
