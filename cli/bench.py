@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from tubepose_cli.paths import named
+
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
@@ -27,9 +29,10 @@ ALL_METHODS = "upright,profile,paper,slot-icp,global-icp"
 
 def bench(
     sessions: Annotated[list[Path] | None, typer.Argument(help="Session folders; default: the bundled sample.")] = None,
-    out: Annotated[Path, typer.Option(help="Folder for the results; nothing is written anywhere else.")] = Path(
-        "out/bench"
-    ),
+    out: Annotated[
+        Path,
+        typer.Option(parser=named, metavar="PATH", help="Folder for the results; nothing is written anywhere else."),
+    ] = Path("out/bench"),
     methods: Annotated[str, typer.Option(help="Methods with commas; 'upright' is the trivial answer.")] = ALL_METHODS,
     seeds: Annotated[int, typer.Option(min=1, help="Seeds of a stochastic method: 0 to N-1.")] = 3,
     detector: Annotated[str, typer.Option(help="Source of boxes: yolo, geometric or recorded.")] = "yolo",

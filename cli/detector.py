@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
+from tubepose_cli.paths import named
+
 if TYPE_CHECKING:
     from tubepose.detection.evaluation import DetectionReport
     from tubepose.training.images import ImageSet
@@ -23,7 +25,12 @@ _UNSEEN_SEED = 1_000_003
 
 @app.command()
 def render(
-    out: Annotated[Path, typer.Option(help="Folder for the pictures and labels; one that was cut off goes on.")],
+    out: Annotated[
+        Path,
+        typer.Option(
+            parser=named, metavar="PATH", help="Folder for the pictures and labels; one that was cut off goes on."
+        ),
+    ],
     labware: Annotated[
         str, typer.Option(help="Racks, tubes and printed caps: names or files, with commas; or catalogue.")
     ] = CATALOGUE,
@@ -58,7 +65,7 @@ def render(
 
 @app.command()
 def train(
-    out: Annotated[Path, typer.Option(help="The .onnx file to write.")],
+    out: Annotated[Path, typer.Option(parser=named, metavar="PATH", help="The .onnx file to write.")],
     labware: Annotated[
         str, typer.Option(help="Racks, tubes and printed caps: names or files, with commas; or catalogue.")
     ] = CATALOGUE,
@@ -146,7 +153,7 @@ def evaluate(
     images: Annotated[Path, typer.Option(help="Folder of pictures.")],
     labels: Annotated[Path, typer.Option(help="Folder of YOLO label files, NAME.txt for NAME.jpg.")],
     classes: Annotated[Path, typer.Option(help="Class names of the labels, one a line.")],
-    out: Annotated[Path, typer.Option(help="Folder for the results.")],
+    out: Annotated[Path, typer.Option(parser=named, metavar="PATH", help="Folder for the results.")],
     model: Annotated[Path | None, typer.Option(help="ONNX file; default: the bundled model.")] = None,
     model_classes: Annotated[Path | None, typer.Option(help="Class names of a model that names none.")] = None,
     map_: Annotated[

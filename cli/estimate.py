@@ -9,6 +9,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from tubepose_cli.paths import named
+
 if TYPE_CHECKING:
     from tubepose.records import Row
 
@@ -17,7 +19,10 @@ def estimate(
     captures: Annotated[
         list[Path], typer.Argument(help="Capture folders, .ply or .mcap files, session folders, or folders of those.")
     ],
-    out: Annotated[Path, typer.Option(help="Folder for the results; nothing is written anywhere else.")],
+    out: Annotated[
+        Path,
+        typer.Option(parser=named, metavar="PATH", help="Folder for the results; nothing is written anywhere else."),
+    ],
     rack: Annotated[
         str | None,
         typer.Option(

@@ -8,10 +8,12 @@ from typing import Annotated
 
 import typer
 
+from tubepose_cli.paths import named
+
 
 def gt(
     sessions: Annotated[list[Path], typer.Argument(help="Session folders.")],
-    out: Annotated[Path, typer.Option(help="Folder for the results.")],
+    out: Annotated[Path, typer.Option(parser=named, metavar="PATH", help="Folder for the results.")],
     fail_fast: Annotated[bool, typer.Option("--fail-fast", help="Stop at the first bad capture.")] = False,
 ) -> None:
     """Measure the true poses of tubes from their printed caps (plane segmentation + square template ICP).

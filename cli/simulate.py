@@ -9,12 +9,14 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
+from tubepose_cli.paths import named
+
 if TYPE_CHECKING:
     from tubepose.simulation import SceneVariation
 
 
 def simulate(
-    out: Annotated[Path, typer.Argument(help="New folder for the simulated session.")],
+    out: Annotated[Path, typer.Argument(parser=named, metavar="OUT", help="New folder for the simulated session.")],
     rack: Annotated[str, typer.Option(help="Rack by name or YAML file.")],
     tubes: Annotated[str, typer.Option(help="Tubes, names or files, with commas.")],
     trials: Annotated[int, typer.Option(min=1, help="Trials per kind of tube.")] = 2,

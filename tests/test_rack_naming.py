@@ -1,5 +1,8 @@
 """Racks that are not named: out of the catalogue, or by pitch and opening alone."""
 
+from dataclasses import replace
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 import scenes
@@ -7,7 +10,8 @@ import scenes
 from tubepose.config import Config
 from tubepose.errors import ConfigError
 from tubepose.labware import SlotShape, load_rack
-from tubepose.rack import RackStatus
+from tubepose.rack import RackStatus, grid
+from tubepose.rack.agreement import Agreement
 from tubepose.rack.grid import register_grid
 from tubepose.rack.lattice import SlotLattice
 from tubepose.rack.naming import catalogue_racks, name_rack
@@ -77,6 +81,32 @@ def test_slots_are_found_by_pitch_and_opening_alone(name):
     found, true = slots_in_camera(pose.rack, pose.T_camera_rack), slots_in_camera(rack, T)
     nearest = np.linalg.norm(found[:, None] - true[None], axis=2).min(axis=1)
     assert nearest.max() < 0.3e-3
+
+
+@pytest.mark.parametrize(
+    ("evidence", "coverage", "rows"),
+    [(157, 0.41, 6), (60, 0.38, 6), (26, 0.38, 5), (157, 0.30, 5)],
+    ids=["a row", "a row under caps", "the edge of the top", "nothing to see"],
+)
+def test_a_row_counts_that_is_seen_and_that_evidence_speaks_for(evidence, coverage, rows, monkeypatch):
+    lattice = SlotLattice(SOFT.grid.pitch_mm, SOFT.grid.slot)
+
+    def registered(_points, T, rack, _config):
+        more = (rack.grid.rows, rack.grid.columns) == (6, 10)
+        seen = Agreement(evidence=786 + more * evidence, coverage=coverage if more else 0.42, spacing_m=5e-4)
+        other = rack.grid.rows > 6 or rack.grid.columns > 10
+        return SimpleNamespace(fit=SimpleNamespace(T_camera_rack=T), agreement=Agreement() if other else seen)
+
+    monkeypatch.setattr(grid, "register_at", registered)
+    grown, _ = grid._grown(np.zeros((0, 3)), np.eye(4), lattice.rack(5, 10), lattice, CONFIG)
+    assert (grown.grid.rows, grown.grid.columns) == (rows, 10)
+
+
+def test_twice_the_pitch_of_a_rack_whose_last_opening_is_near_its_edge_is_told_of():
+    lattice = SlotLattice((22.0, 23.0), SlotShape(shape="round", size_mm=(17.0, 17.0)))
+    pose = register_grid(scan(lattice.rack(3, 7, (10.5, 8.5)))[0], replace(lattice, pitch_mm=(44.0, 23.0)), CONFIG)
+    assert pose.status is RackStatus.REFUSED
+    assert "slots 22 x 23 mm apart explain the points better" in pose.reason
 
 
 def test_slots_of_another_pitch_are_not_found():
