@@ -14,6 +14,7 @@ from tubepose.batch import MOST_ASKED, Job, Tables, UnnamedJob, run_jobs, sessio
 from tubepose.capture.frame import RgbdFrame
 from tubepose.capture.session import Session, SlotHint, load_session
 from tubepose.config import Config
+from tubepose.detection import Detection
 from tubepose.detection.geometric import GeometricDetector
 from tubepose.errors import CaptureError, DetectorError
 from tubepose.labware import load_rack, load_tube
@@ -106,6 +107,17 @@ def test_ctrl_c_keeps_the_rows_of_what_was_done(stop: BaseException) -> None:
 def test_a_system_error_that_is_no_ctrl_c_is_raised() -> None:
     with pytest.raises(SystemError):
         run(job("good", GOOD, problem=in_compiled_code(ValueError())))
+
+
+def test_other_racks_in_view_are_counted() -> None:
+    class TwoRacks(GeometricDetector):
+        def detect(self, frame: RgbdFrame) -> tuple[Detection, ...]:
+            found = super().detect(frame)
+            rack = next(detection for detection in found if detection.is_rack)
+            return (replace(rack, score=0.3, point_rows=rack.point_rows[:10]), *found)
+
+    tables = run_jobs([job("good", GOOD)], ("upright",), lambda rack, tubes: TwoRacks(rack, tubes, CONFIG), CONFIG)
+    assert [(row["n_racks_detected"], row["status"], row["box_score"]) for row in tables.racks] == [(2, "ok", 1.0)]
 
 
 def test_fail_fast_raises_the_first_problem() -> None:

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from tubepose.config import ProfileConfig
-from tubepose.profile.plane import fit_top_planes
+from tubepose.profile.plane import fit_top_planes, top_spacing_m
 
 CONFIG = ProfileConfig()
 RADIUS_M = 9e-3
@@ -31,6 +31,14 @@ def test_a_clean_tilted_disc_is_exact(slope):
     found = fit(disc(slope))
     assert found.slope[0] == pytest.approx(slope, abs=1e-9)
     assert found.height_m[0] == pytest.approx(HEIGHT_M, abs=1e-12)
+
+
+def test_the_spacing_of_a_top_is_that_of_its_points():
+    # A disc of 2000 points, and one of 125, four times as far apart; what is no plane has none.
+    found = fit(disc(), disc(count=125), disc(height_m=0.3))
+    spacing = top_spacing_m(found, np.full(3, RADIUS_M))
+    assert spacing[:2] == pytest.approx(np.sqrt(np.pi * RADIUS_M**2 / np.array([2000, 125])), rel=0.05)
+    assert np.isnan(spacing[2])
 
 
 def test_each_top_has_its_own_plane():
