@@ -41,7 +41,7 @@ def run_estimates(
     Raises:
         StoppedError: The user stopped the run. What was done by then is written; nothing where nothing was done.
     """
-    from tubepose.batch import run_jobs
+    from tubepose.batch import Tables, run_jobs
     from tubepose.errors import StoppedError
     from tubepose.provenance import pinned_threads, run_record
     from tubepose.records import ESTIMATE_COLUMNS, RACK_COLUMNS, SLOT_COLUMNS, TIMING_COLUMNS, to_table
@@ -55,14 +55,17 @@ def run_estimates(
             write_overlay(out / "overlays" / overlay_name(job, scene, taken), scene, estimates)
 
     make_folder(out)
-    with pinned_threads(1), progress("captures", len(jobs)) as step:
-        tables = run_jobs(
-            jobs, methods, detector_for, config, seeds=seeds, warm_up=warm_up, fail_fast=fail_fast,
-            on_scene=draw, on_done=step,
-        )  # fmt: skip
-    stopped = f"interrupted: {tables.done} of {len(jobs)} captures are done" if tables.done < len(jobs) else ""
-    if stopped and not tables.done:
-        raise StoppedError(f"{stopped}; no table is written to {out}")
+    tables, stopped = Tables(), ""
+    try:
+        with pinned_threads(1), progress("captures", len(jobs)) as step:
+            run_jobs(
+                jobs, methods, detector_for, config, seeds=seeds, warm_up=warm_up, fail_fast=fail_fast,
+                on_scene=draw, on_done=step, tables=tables,
+            )  # fmt: skip
+    except KeyboardInterrupt:
+        stopped = f"interrupted: {tables.done} of {len(jobs)} captures are done"
+        if not tables.done:
+            raise StoppedError(f"{stopped}; no table is written to {out}") from None
     write_csv(out / "racks.csv", to_table(tables.racks, RACK_COLUMNS))
     write_csv(out / "slots.csv", to_table(tables.slots, SLOT_COLUMNS))
     write_csv(out / "estimates.csv", to_table(tables.estimates, ESTIMATE_COLUMNS))

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+from dataclasses import replace
 from itertools import permutations
 
 import numpy as np
@@ -8,7 +9,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tubepose.capture import CameraIntrinsics, estimate_intrinsics, project_cloud
-from tubepose.capture.registration import clean_cloud, is_mirrored
+from tubepose.capture.frame import RgbdFrame
+from tubepose.capture.registration import clean_cloud, is_mirrored, refuse_mirrored
+from tubepose.errors import CaptureError
 from tubepose.transforms import axis_rotation, make_transform, transform_points
 
 CAMERA = CameraIntrinsics(width=20, height=10, fx=30.0, fy=31.0, cx=9.5, cy=4.5)
@@ -74,6 +77,17 @@ def test_a_cloud_in_a_mirror_is_told_from_one_that_is_turned(signs):
     assert is_mirrored(cloud * [*signs, 1]) == (signs[0] * signs[1] < 0)
     assert not is_mirrored(np.random.default_rng(3).permutation(cloud.reshape(-1, 3)).reshape(cloud.shape))
     assert not is_mirrored(np.full((160, 200, 3), np.nan))
+
+
+def test_a_mirrored_frame_is_refused_and_others_are_not():
+    cloud = CameraIntrinsics(200, 160, 300.0, 310.0, 101.0, 83.0).backproject(np.full((160, 200), 0.8))
+    frame = RgbdFrame(cloud, None, None, None, "scan", index=3)
+    refuse_mirrored(frame)
+    refuse_mirrored(replace(frame, cloud_m=(cloud * [-1, 1, 1]).reshape(1, -1, 3), organised=False))
+    with pytest.raises(
+        CaptureError, match=r"^frame 3: the cloud is mirrored against its pixels; expected x to the right"
+    ):
+        refuse_mirrored(replace(frame, cloud_m=cloud * [-1, 1, 1]))
 
 
 @pytest.mark.parametrize("mark", [3.4e38, -1e30, 1e7])

@@ -151,8 +151,9 @@ def run_jobs(
     fail_fast: bool = False,
     on_scene: Callable[[Job, Scene, tuple[TubeEstimate, ...]], None] | None = None,
     on_done: Callable[[], None] | None = None,
+    tables: Tables | None = None,
 ) -> Tables:
-    """Run the methods on every frame of every job, until the user stops it: rows of captures that are done are kept.
+    """Run the methods on every frame of every job.
 
     Args:
         jobs: What to run.
@@ -164,8 +165,12 @@ def run_jobs(
         fail_fast: Raise the first problem instead of keeping it.
         on_scene: Called with each frame's result by one of the methods, ours if it is among them (overlays).
         on_done: Called after each job (progress).
+        tables: Empty ones to fill, to keep what was done where the user stops the run; by default new ones.
+
+    Raises:
+        KeyboardInterrupt: The user stopped the run, in compiled code or not; `tables` hold the jobs that were done.
     """
-    tables, warmed = Tables(), 0
+    tables, warmed = Tables() if tables is None else tables, 0
 
     def run(job: Job | UnnamedJob) -> None:
         nonlocal warm_up, warmed
@@ -184,10 +189,10 @@ def run_jobs(
             with kept(None if fail_fast else tables.problems, partial(_one_line, job)):
                 run(job)
         except (KeyboardInterrupt, SystemError) as problem:
+            tables.cut(before)
             if not is_interrupt(problem):
                 raise
-            tables.cut(before)
-            break
+            raise KeyboardInterrupt from problem
         tables.done += 1
         if on_done is not None:
             on_done()

@@ -8,12 +8,11 @@ from typing import TypeGuard
 
 from tubepose.baselines import fit_global_icp, fit_slot_icp, fit_upright
 from tubepose.capture.frame import CameraIntrinsics, RgbdFrame
-from tubepose.capture.registration import estimate_intrinsics, is_mirrored
+from tubepose.capture.registration import estimate_intrinsics, refuse_mirrored
 from tubepose.capture.session import SlotHint
 from tubepose.config import Config
 from tubepose.detection import Detection, Detector, points_in_box
 from tubepose.detection.assisted import AssistedDetector
-from tubepose.errors import CaptureError
 from tubepose.labware import RackModel, TubeModel
 from tubepose.preprocessing import remove_outliers
 from tubepose.profile import ProfileTube, fit_profiles
@@ -69,11 +68,7 @@ def prepare_scene(
         DetectorError: The detector cannot work on this frame.
     """
     clock = Clock()
-    if frame.organised and is_mirrored(frame.cloud_m):
-        raise CaptureError(
-            f"frame {frame.index}: the cloud is mirrored against its pixels; expected x to the right of the image, "
-            "y down and z forward: turn the sign of one axis when you export it"
-        )
+    refuse_mirrored(frame)
     intrinsics = frame.intrinsics
     if intrinsics is None and frame.organised:
         intrinsics = estimate_intrinsics(frame.cloud_m)

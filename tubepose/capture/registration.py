@@ -9,7 +9,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from tubepose.capture.frame import CameraIntrinsics
+from tubepose.capture.frame import CameraIntrinsics, RgbdFrame
+from tubepose.errors import CaptureError
 from tubepose.transforms import FloatArray, transform_points
 
 METRES_PER_UNIT = {"m": 1.0, "mm": 1.0e-3}
@@ -104,6 +105,19 @@ def is_mirrored(cloud_m: FloatArray) -> bool:
     """
     lines = _fit_lines(cloud_m[::MIRROR_STEP, ::MIRROR_STEP])
     return lines is not None and lines[0][0] * lines[1][0] < 0
+
+
+def refuse_mirrored(frame: RgbdFrame) -> None:
+    """Say so where a frame's cloud is mirrored: poses in it would be, too.
+
+    Raises:
+        CaptureError: It is.
+    """
+    if frame.organised and is_mirrored(frame.cloud_m):
+        raise CaptureError(
+            f"frame {frame.index}: the cloud is mirrored against its pixels; expected x to the right of the image, "
+            "y down and z forward: turn the sign of one axis when you export it"
+        )
 
 
 def _fit_lines(cloud_m: FloatArray) -> tuple[tuple[float, float], tuple[float, float]] | None:

@@ -16,7 +16,6 @@ from scipy.spatial import cKDTree
 
 from tubepose.config import RackConfig
 from tubepose.labware import RackModel
-from tubepose.rack import kernels as kernels
 from tubepose.rack import view_kernels as view_kernels
 from tubepose.rack.evidence import evidence_of
 from tubepose.rack.field import GRID_M, PICTURE_M, picture, top_field
@@ -104,7 +103,8 @@ def measure_agreement(points_m: FloatArray, fit: Fit, rack: RackModel, config: R
     near = distance < config.judge_distance_m
     beyond = np.max(np.abs(solid[:, :2]) - rack.outline_m / 2, axis=1)
     stray = distance > config.edge_margin_m
-    ribs = _on_ribs(points_m, fit, rack, SCATTER_M if fit.level is None else HELD_SCATTER_M)
+    height_m = SCATTER_M if fit.level is None else HELD_SCATTER_M
+    ribs = top.on_solid(points_m, top_frame(fit.T_camera_rack, rack), height_m)
     spacing_m = _spacing(ribs[:, :2])
     scatter_m = float(1.4826 * np.median(np.abs(ribs[:, 2])))
     evidence, beside, step_m = evidence_of(seen, rack)
@@ -135,13 +135,6 @@ def rough_evidence(points_m: FloatArray, rough: RoughFit, spacing_m: float, rack
 def _alike(spacing_m: float) -> float:
     """For how many independent points one stands, at most 1."""
     return min(1.0, (spacing_m / INDEPENDENT_M) ** 2)
-
-
-def _on_ribs(points_m: FloatArray, fit: Fit, rack: RackModel, height_m: float) -> FloatArray:
-    """Points near the solid part of the top, frame of the top, shape (N, 3), metres; rough scans have more of them."""
-    T = top_frame(fit.T_camera_rack, rack)
-    local, distance, _ = kernels.laid(points_m, T[:3, :3], T[:3, 3], height_m, *top_field(rack).grid)
-    return np.asarray(local[distance < 0])
 
 
 def _unseen(points_m: FloatArray, fit: Fit, rack: RackModel) -> float:

@@ -54,6 +54,14 @@ class TopField:
         distance, slope, known = kernels.look_up(xy_m, *self.grid)
         return distance, slope, known
 
+    def on_solid(
+        self, points_m: FloatArray, T_camera_top: FloatArray, height_m: float, inside_m: float = 0.0
+    ) -> FloatArray:
+        """Points (N, 3), camera frame, in a top's frame: within a height of it, and so far inside its solid part."""
+        R, origin_m = T_camera_top[:3, :3], T_camera_top[:3, 3]
+        local, distance, _ = kernels.laid(points_m, R, origin_m, height_m, *self.grid)
+        return np.asarray(local[distance < -inside_m])
+
     @property
     def grid(self) -> tuple[FloatArray, float, tuple[int, int], Float32]:
         """What the kernels take: place of the first cell, side of a cell (metres), cells along x and y, the table."""

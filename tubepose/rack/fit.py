@@ -139,22 +139,17 @@ def refine(state: RoughFit, rack: RackModel) -> Fit:
     for number, (blur_m, widths_m) in enumerate(ROUNDS_M[ROUGH_ROUNDS:], ROUGH_ROUNDS):
         if state.stray <= HOPELESS_SHARE:
             _step(fine, state, field, blur_m, widths_m, number == len(ROUNDS_M) - 1)
-    covariance = _covariance(state, _lifted(fine, state.T_camera_top, field))
+    covariance = _covariance(state, fine, field)
     return Fit(rack_frame(state, rack), covariance, state.scatter_m, *_stretch(state, field), state.level)
 
 
-def _lifted(points_m: FloatArray, T_camera_top: FloatArray, field: TopField) -> float:
-    """Share of the points (N, 3) on the solid part that lie far above or below its plane."""
-    local, distance, _ = kernels.laid(points_m, T_camera_top[:3, :3], T_camera_top[:3, 3], np.inf, *field.grid)
-    off_m = np.abs(local[distance < -INSIDE_M, 2])
-    return float(np.mean(off_m > LIFTED_M)) if len(off_m) else 1.0
-
-
-def _covariance(state: RoughFit, lifted: float) -> FloatArray:
+def _covariance(state: RoughFit, points_m: FloatArray, field: TopField) -> FloatArray:
     """Of the pose's error, shape (6, 6): that of the last round, and what it cannot know of."""
     inflate = INFLATE if state.level is None else INFLATE_HELD
     covariance = np.asarray(inflate @ state.covariance @ inflate + np.diag(FLOOR**2))
     if state.level is None:
+        off_m = np.abs(field.on_solid(points_m, state.T_camera_top, np.inf, INSIDE_M)[:, 2])
+        lifted = float(np.mean(off_m > LIFTED_M)) if len(off_m) else 1.0
         covariance[PLANE] *= 1 + (lifted / LIFTED_SHARE) ** 2
         return covariance
     covariance[5, 5] += FLOOR_HELD_M**2

@@ -107,7 +107,7 @@ def _grown(
         for side in SIDES:
             grown, T_more = _with_line(before[0], before[1].fit.T_camera_rack, np.array(side), lattice)
             more = register_at(points_m, T_more, grown, config.rack)
-            # The line that is added must be seen half as well as the others: what is not seen adds evidence, too.
+            # What is not seen adds evidence, too.
             lines = max(abs(side[0]) * grown.grid.columns, abs(side[1]) * grown.grid.rows) if grown.grid else 1
             if more.agreement.coverage <= seen.coverage * (1 - (1 - SEEN_SHARE) / lines):
                 continue

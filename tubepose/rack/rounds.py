@@ -138,7 +138,7 @@ def plane_step(points_m, off_m, balance, reach_m, normal):
 
 
 @compiled
-def plane_steps(points_m, balance, widths_m, widest_m, held):
+def plane_steps(points_m, balance, widths_m, held):
     """Plane of points (N, 3) where heights are densest, windows narrowed: turns about x, y and height; scatter.
 
     Returns them with the last normal equations (3, 3) and the scores (N, 3) of the points where the steps ended. Where
@@ -154,7 +154,7 @@ def plane_steps(points_m, balance, widths_m, widest_m, held):
         for k in range(len(points_m)):
             off[k] = points_m[k, 2] - points_m[k, 1] * found[0] + points_m[k, 0] * found[1] - found[2]
         scatter = 1.4826 * median_size(off, max(width, 2 * scatter))
-        reach = max(width, min(2 * scatter, widest_m))
+        reach = max(width, min(2 * scatter, WIDEST_M))
         normal = np.diag(np.array([stiff, stiff, 1e-6]))
         found = found + solved(normal, plane_step(points_m, off, balance, reach, normal))
     for k in range(len(points_m)):
@@ -167,16 +167,16 @@ def plane_steps(points_m, balance, widths_m, widest_m, held):
 
 
 @compiled
-def edge_step(points_m, distance_m, slope, window_m, shift_m, blur_m, wrong, count):
+def edge_step(points_m, distance_m, slope, window_m, blur_m, count):
     """Information (M, M) and scores (N, M) of edges about yaw, shift and, for M = 5, stretch; places (N, 2) of them.
 
     Of points (K, 3) whose heights are within the window, with their distance to the solid part and its gradient.
     """
-    information, design = np.zeros((count, count)), np.zeros(5)
+    information, design, wrong = np.zeros((count, count)), np.zeros(5), WRONG_SHARE
     scores, xy = np.empty((len(points_m), count)), np.empty((len(points_m), 2))
     kept = 0
     for k in range(len(points_m)):
-        eta = (shift_m - distance_m[k]) / blur_m
+        eta = (EDGE_SHIFT_M - distance_m[k]) / blur_m
         if not (abs(points_m[k, 2]) < window_m and abs(eta) < 6.0):
             continue
         plain = 1.0 / (1.0 + math.exp(-eta))
@@ -200,7 +200,7 @@ def edge_step(points_m, distance_m, slope, window_m, shift_m, blur_m, wrong, cou
 @compiled
 def edge_move(local_m, distance_m, slope, window_m, blur_m, count):
     """One step of Fisher scoring about yaw, shift and, for `count` 5, stretch; `edge_step` that it is made from."""
-    information, scores, xy = edge_step(local_m, distance_m, slope, window_m, EDGE_SHIFT_M, blur_m, WRONG_SHARE, count)
+    information, scores, xy = edge_step(local_m, distance_m, slope, window_m, blur_m, count)
     information = information + np.diag(np.array([1e1, 1e5, 1e5, 1e1, 1e1])[:count])
     step = solved(information, scores.sum(axis=0))
     return step * min(1.0, LONGEST_STEP_M / max(abs(step[1]), abs(step[2]), 1e-12)), (information, scores, xy)
@@ -214,14 +214,13 @@ def round_step(points_m, rotation, origin_m, window_m, blur_m, widths_m, held, l
     goes astray sinks or lifts whole stretches of ribs. Places count alike, not points: a wall at the outline has most.
 
     Returns:
-        Plane: turns about x and y, and height; the scatter of heights; normal equations (3, 3), scores (K, 3) and
-        the points (K, 3). Edges: yaw and shifts (3,), and what `edge_step` gives. The share of points astray.
+        What `plane_steps` gives, and its points (K, 3); what `edge_move` gives; the share of points astray.
     """
     height_m = max(window_m, widths_m[0])
     local, distance, slope = laid(points_m, rotation, origin_m, height_m, low_m, cell_m, shape, table)
     inside = local[distance < -INSIDE_M]
     balance = 1.0 / np.maximum(square_counts(inside, SHARED_LENGTH_M), FULL_SQUARE)
-    plane = plane_steps(inside, balance, widths_m, WIDEST_M, held)
+    plane = plane_steps(inside, balance, widths_m, held)
     astray, total = 0, 0
     for k in range(len(local)):
         if abs(local[k, 2]) < window_m:

@@ -163,11 +163,9 @@ def _one_kind(centers_m: FloatArray, heights_m: FloatArray) -> NDArray[np.bool_]
 
 def _height(ribs_m: FloatArray, T_camera_top: FloatArray, rack: RackModel) -> float:
     """Height of the ribs that show, over the level of a frame: that of the highest peak that counts."""
-    local, distance, _ = kernels.laid(
-        ribs_m, T_camera_top[:3, :3], T_camera_top[:3, 3], PEAK_REACH_M, *top_field(rack).grid
-    )
+    solid_m = top_field(rack).on_solid(ribs_m, T_camera_top, PEAK_REACH_M)
     edges = np.arange(-PEAK_REACH_M, PEAK_REACH_M + PEAK_BIN_M / 2, PEAK_BIN_M)
-    counts = np.convolve(np.histogram(local[distance < 0, 2], edges)[0], [0.5, 1, 1, 1, 0.5], "same")
+    counts = np.convolve(np.histogram(solid_m[:, 2], edges)[0], [0.5, 1, 1, 1, 0.5], "same")
     padded = np.pad(counts, 1)
     peaks = (counts > padded[:-2]) & (counts >= padded[2:]) & (counts >= PEAK_SHARE * counts.max())
     return float(edges[np.flatnonzero(peaks)[-1]] + PEAK_BIN_M / 2) if peaks.any() else 0.0
