@@ -20,8 +20,8 @@ _MAX_RESIDUAL_PX = 1.0
 _MIN_POINTS = 100
 
 
-MIRROR_STEP = 8
-"""Every so many pixels tell a mirrored cloud."""
+MIRROR_PIXELS = 4000
+"""So many pixels, evenly spread, tell a mirrored cloud."""
 FARTHEST_M = 1e4
 """No sensor of racks sees as far: numbers like this mark a missing point."""
 
@@ -103,7 +103,8 @@ def is_mirrored(cloud_m: FloatArray) -> bool:
 
     Some pixels of it are looked at. A cloud that is turned with its pixels, or that is no camera's, is not mirrored.
     """
-    lines = _fit_lines(cloud_m[::MIRROR_STEP, ::MIRROR_STEP])
+    step = max(1, int(np.sqrt(cloud_m.shape[0] * cloud_m.shape[1] / MIRROR_PIXELS)))
+    lines = _fit_lines(cloud_m[::step, ::step])
     return lines is not None and lines[0][0] * lines[1][0] < 0
 
 

@@ -1,4 +1,4 @@
-"""The loops over sectors, samples and points of walls, compiled; see `kernels`, whose promises these keep."""
+"""The loops over samples, points of walls and rings, compiled; see `kernels`, whose promises these keep."""
 
 from __future__ import annotations
 
@@ -6,56 +6,10 @@ import math
 
 import numpy as np
 
-from tubepose.compiled import compiled, solved
+from tubepose.compiled import compiled
 
-ROUNDS = 6
-"""Of the reweighted least squares of circles."""
-HUBER = 1.5
-"""Residuals larger than this many standard deviations count as if they were that large."""
 LARGEST = 200.0
 """Exponents are cut here: the product of three such powers is still a number."""
-
-
-@compiled
-def circle_rounds(excess_m, seen, sigma_m, design, prior, least_seen):
-    """Huber regression of the excess radii (T, S) that are seen on a design (S, M), with a prior of information (M, M).
-
-    Returns the solutions (T, M), the last normal equations (T, M, M), the sums of squared residuals (T,) and how many
-    sectors are seen (T,); where fewer than the least, nothing is solved.
-    """
-    tubes, sectors = excess_m.shape
-    unknowns = design.shape[1]
-    solution, squares = np.zeros((tubes, unknowns)), np.zeros(tubes)
-    normal, counts = np.zeros((tubes, unknowns, unknowns)), np.zeros(tubes, np.intp)
-    weight, right = np.empty(sectors), np.empty(unknowns)
-    for t in range(tubes):
-        for s in range(sectors):
-            counts[t] += seen[t, s]
-            weight[s] = 1.0 / sigma_m[t] ** 2 if seen[t, s] else 0.0
-        if counts[t] < least_seen:
-            normal[t] = np.eye(unknowns)
-            continue
-        for _ in range(ROUNDS):
-            normal[t] = prior
-            right[:] = 0.0
-            for s in range(sectors):
-                if seen[t, s]:
-                    for i in range(unknowns):
-                        scaled = weight[s] * design[s, i]
-                        right[i] += scaled * excess_m[t, s]
-                        for j in range(unknowns):
-                            normal[t, i, j] += scaled * design[s, j]
-            solution[t] = solved(normal[t], right)
-            squares[t] = 0.0
-            for s in range(sectors):
-                if seen[t, s]:
-                    residual = excess_m[t, s]
-                    for i in range(unknowns):
-                        residual -= design[s, i] * solution[t, i]
-                    size = abs(residual)
-                    squares[t] += residual * residual
-                    weight[s] = min(1.0, HUBER * sigma_m[t] / max(size, 1e-9)) / sigma_m[t] ** 2
-    return solution, normal, squares, counts
 
 
 @compiled

@@ -13,8 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tubepose.config import ProfileConfig
-from tubepose.profile.fit_kernels import circle_rounds
-from tubepose.profile.kernels import sector_counts
+from tubepose.profile.outline_kernels import COARSE_BAND_M, circle_rounds, sector_ends
 from tubepose.transforms import FloatArray
 
 SECTORS = 24
@@ -24,11 +23,6 @@ DESIGN: FloatArray = np.column_stack([NORMALS, np.ones(SECTORS), np.cos(2 * ANGL
 """Offset along x and y, widening, and the two parts of an ellipse, as they change the radius of a sector."""
 WIDTHS_M = ((2.0e-3, 2.0e-3), (1.2e-3, 1.2e-3), (0.8e-3, 0.9e-3))
 """How far inside and outside of the circle a sector's end is looked for, round by round."""
-DENSITY_BAND_M = 1.0e-3
-"""The ring inside of that, where the density of points is taken from."""
-COARSE_BAND_M = 2.5e-3
-MIN_CORE_POINTS = 6.0
-"""A coarse scan has no more points than this of a sector in that ring: it gets a wider one, and less trust."""
 MAX_STD_M = 1.0e-3
 """A circle that is not known better than this is not known."""
 OUTLINE_DEPTH_M = WIDTHS_M[0][0] + COARSE_BAND_M
@@ -100,7 +94,7 @@ def fit_discs(
     shift = np.zeros((count, 2))
     circles = None
     for inside_m, outside_m in WIDTHS_M:
-        end_m, seen, counting_m = _sector_ends(label, offset_m, shift, radius_m, inside_m, outside_m)
+        end_m, seen, counting_m = sector_ends(label, offset_m, shift, radius_m, inside_m, outside_m, SECTORS)
         sigma_m = np.hypot(config.outline_noise_m, counting_m)
         circles = fit_circles(end_m - radius_m[:, None], seen & ~blocked, config, sigma_m, config.outline_bias_m)
         shift += np.nan_to_num(circles.offset_m)
@@ -111,39 +105,6 @@ def fit_discs(
         circles.widening_m,
         circles.sectors,
     )
-
-
-def _sector_ends(
-    label: NDArray[np.intp],
-    offset_m: FloatArray,
-    shift_m: FloatArray,
-    radius_m: FloatArray,
-    inside_m: float,
-    outside_m: float,
-) -> tuple[FloatArray, NDArray[np.bool_], FloatArray]:
-    """Radius at which each sector ends, shape (T, SECTORS), metres, and whether it is filled up to there.
-
-    The end is where the points of the sector would end if they lay as dense as those further in. The last is what
-    counting few points adds to its error, shape (T,), metres: 0 but in a coarse scan.
-    """
-    width = 2 * np.pi / SECTORS
-    low, high = radius_m - inside_m, radius_m + outside_m
-    lower = low - DENSITY_BAND_M
-    core, counted = sector_counts(label, offset_m, shift_m, lower, low, high, SECTORS)
-    usual = np.median(core, axis=1)
-    coarse = usual <= MIN_CORE_POINTS
-    if coarse.any():
-        lower = np.where(coarse, low - COARSE_BAND_M, lower)
-        core, _ = sector_counts(label, offset_m, shift_m, lower, low, high, SECTORS)
-        filled = core > 0.5 * np.median(core, axis=1)[:, None]
-        mean = (core * filled).sum(axis=1) / np.maximum(filled.sum(axis=1), 1)
-        usual = np.where(coarse, mean, usual)
-    density = usual / (0.5 * width * (low**2 - lower**2))
-    with np.errstate(divide="ignore", invalid="ignore"):
-        end = np.sqrt(low[:, None] ** 2 + 2 * counted / (width * density[:, None]))
-        counting = 0.5 * np.sqrt(inside_m / (width * density * radius_m))
-    seen = (core > (np.where(coarse, 0.5, 0.8) * usual)[:, None]) & (usual > MIN_CORE_POINTS / 3)[:, None]
-    return np.where(seen, end, np.nan), seen, np.where(coarse & (density > 0), counting, 0.0)
 
 
 def fit_circles(
@@ -161,9 +122,9 @@ def fit_circles(
     """
     sigma = np.array(np.broadcast_to(np.asarray(sigma_m, float), len(excess_m)))
     prior = np.diag([0.0, 0.0, *np.full(3, config.widening_m**-2)])
-    solution, normal, squares, counts = circle_rounds(excess_m, seen, sigma, DESIGN, prior, SECTORS // 4)
+    solution, covariance, squares, counts = circle_rounds(excess_m, seen, sigma, DESIGN, prior, SECTORS // 4)
     scatter = squares / np.maximum(counts - 3, 1)
-    covariance = np.linalg.inv(normal)[:, :2, :2] + np.eye(2) * bias_m**2
+    covariance = covariance + np.eye(2) * bias_m**2
     covariance *= np.maximum(scatter / sigma**2, 1.0)[:, None, None]
     usable = (counts >= SECTORS // 4) & (np.trace(covariance, axis1=1, axis2=2) < MAX_STD_M**2)
     return Circles(np.where(usable[:, None], solution[:, :2], np.nan), covariance, solution[:, 2], counts / SECTORS)

@@ -8,14 +8,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tubepose.config import ProfileConfig
-from tubepose.profile.kernels import plane_sums
+from tubepose.profile.plane_kernels import plane_rounds
 from tubepose.transforms import FloatArray
 
-ROUNDS = 4
 EDGE_M = 1.0e-3
 """Points this near the end of a top are mixed with its background."""
-LEAST_SIGMA_M = 3.0e-5
-"""No sensor is better: points on a perfect plane must not be thrown out for rounding."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -63,18 +60,9 @@ def fit_top_planes(
     count = len(expected_m)
     inner_m = np.maximum(radius_m - EDGE_M, 0.0)
     step = max(1, len(height_m) // max(config.plane_points * count, 1))
-    few = np.s_[:: 4 * step]
-    inside = np.hypot(*offset_m[few].T) < inner_m[label[few]]
-    inside &= np.abs(height_m[few] - expected_m[label[few]]) < config.top_band_m
-    start = _median_per_label(label[few][inside], height_m[few][inside], expected_m)
-    planes = np.column_stack([start, np.zeros((count, 2))])
-    sigma = np.full(count, config.top_band_m / 3)
-    n = np.zeros(count, np.intp)
-    for every in (*[step] * ROUNDS, 1):
-        sums = plane_sums(label, offset_m, height_m, expected_m, config.top_band_m, inner_m, planes, sigma, every)
-        planes = _solve(sums, planes, config)
-        sigma = np.maximum(np.sqrt(sums[:, 9] / np.maximum(sums[:, 0], 1e-9)), LEAST_SIGMA_M)
-        n = sums[:, 10].astype(np.intp)
+    planes, sigma, n = plane_rounds(
+        label, offset_m, height_m, expected_m, config.top_band_m, inner_m, step, config.min_top_points / 4
+    )
     enough = n >= config.min_top_points
     lever2 = radius_m**2 / 4
     # One independent shared error per patch of the error's reach.
@@ -85,7 +73,7 @@ def fit_top_planes(
         np.where(enough[:, None], planes[:, 1:], np.nan),
         slope_var,
         np.where(enough, sigma, np.nan),
-        n,
+        n.astype(np.intp),
     )
 
 
@@ -93,21 +81,3 @@ def top_spacing_m(planes: TopPlanes, radius_m: FloatArray) -> FloatArray:
     """How far apart the points of tops of these radii (T,) lie, shape (T,), metres; NaN without a plane."""
     area_m2 = np.pi * np.maximum(radius_m - EDGE_M, 0.0) ** 2
     return np.where(np.isfinite(planes.height_m), np.sqrt(area_m2 / np.maximum(planes.n_points, 1)), np.nan)
-
-
-def _median_per_label(label: NDArray[np.intp], values: FloatArray, default: FloatArray) -> FloatArray:
-    """Median of the values of each label, the default without any; shape (T,)."""
-    order = np.lexsort((values, label))
-    counts = np.bincount(label, minlength=len(default))
-    ends = np.cumsum(counts)
-    middle = np.minimum(ends - counts + counts // 2, max(len(values) - 1, 0))
-    return np.where(counts > 0, values[order][middle], default) if len(values) else default.copy()
-
-
-def _solve(sums: FloatArray, before: FloatArray, config: ProfileConfig) -> FloatArray:
-    """Planes from the sums of `plane_sums`, shape (T, 3); as before where there are too few points."""
-    normal = sums[:, [0, 1, 2, 1, 3, 4, 2, 4, 5]].reshape(-1, 3, 3)
-    usable = (sums[:, 0] >= config.min_top_points / 4) & (np.linalg.det(normal) > 0)
-    normal[~usable] = np.eye(3)
-    solved = np.linalg.solve(normal, sums[:, 6:9, None])[..., 0]
-    return np.where(usable[:, None], solved, before)

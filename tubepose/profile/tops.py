@@ -128,6 +128,8 @@ def find_tops(
             break
         best[new], place[new] = kind[new], where[new]
         second[new] = ranked[-2, new] if len(tubes) > 1 else -np.inf
+        if np.all(best >= 0):
+            break
         for k in range(len(tubes)):
             _erase(pictures[k], place[new, 1:], [top_radius_m(tubes[best[i]]) for i in new], rack)
     kept = np.flatnonzero(best >= 0)
