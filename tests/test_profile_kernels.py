@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from scipy.ndimage import map_coordinates
 from scipy.special import log_expit
 
 from tubepose.labware import load_rack
@@ -127,21 +128,62 @@ def test_nothing_that_is_impossible_overflows():
     assert 0 <= allowed[0] < 1e-100
 
 
-def test_a_direction_votes_for_brighter_than_both_sides():
-    ring = np.array([[0, 3], [3, 0], [0, -3], [-3, 0]])
-    beside = (ring // 3 * 2, ring // 3 * 4)
-    picture = np.full((21, 21), 50, np.float32)
-    picture[tuple((ring + 10).T)] = (150, 150, 150, 20)  # three directions brighter, one darker
-    shifts = np.array([[0, 0], [1, 1]])
-    votes, best = fit_kernels.ring_votes(picture, np.array([[10, 10], [9, 9], [0, 0]]), shifts, ring, *beside, 1e-6)
-    assert votes[:2, 0] == pytest.approx((0.5, 0.5))
-    assert best[:2, 0].tolist() == [0, 1]
-    assert votes[2, 0] < 0.5  # half of the directions lie beyond the picture: they have no vote
-    dark, where = fit_kernels.ring_votes(150 - picture, np.array([[9, 9]]), shifts, ring, *beside, 1e-6)
-    assert (dark[0, 1], where[0, 1]) == (pytest.approx(0.5), 1)  # the same ring, darker
-    picture[tuple(ring[:2].T + 10)] = np.nan  # nothing is known there
-    votes, _ = fit_kernels.ring_votes(picture, np.array([[10, 10]]), shifts[:1], ring, *beside, 1e-6)
-    assert votes[0, 0] == pytest.approx(0.0, abs=1e-6)  # one for, one against
+def test_a_ring_is_even_by_what_it_varies_against_what_is_beside_it():
+    rng = np.random.default_rng(6)
+    picture = rng.uniform(0, 1, (60, 64)).astype(np.float32)
+    angles = np.arange(16) * 2 * np.pi / 16
+    around, ring, sides = np.column_stack([np.cos(angles), np.sin(angles)]), np.array([6.7, 7.2]), (9.3, 5.1)
+    place, shifts = np.array([[30.2, 31.4], [3.0, 30.0]]), np.array([[0.0, 0.0], [1.5, -0.5]])
+
+    def gray(at, radius):
+        return map_coordinates(picture.astype(float), (at + radius * around).T, order=1)
+
+    def evenness(at):
+        own = np.stack([gray(at, radius) for radius in ring])
+        beside = [np.mean((gray(at, radius) - own.mean()) ** 2) + 0.01 for radius in sides]
+        return 1 - (own.var() + 0.01) / np.cbrt(beside[0] ** 2 * beside[1])
+
+    found, best = fit_kernels.even_rings(picture, place, shifts, around, ring, *sides, 12, 0.01)
+    expected = [evenness(place[0] + shift) for shift in shifts]
+    assert found[0] == pytest.approx(max(expected), abs=1e-5)
+    assert best[0] == int(np.argmax(expected))
+    assert found[1] == -np.inf  # it leaves the picture
+    picture[:, 33:] = np.nan
+    assert fit_kernels.even_rings(picture, place, shifts, around, ring, *sides, 12, 0.01)[0][0] == -np.inf
+
+
+def test_what_is_beside_a_ring_is_told_by_direction():
+    x, y = np.meshgrid(np.arange(60.0), np.arange(60.0), indexing="ij")
+    rho, east = np.hypot(x - 30, y - 30), x > 30
+    picture = np.where(rho < 10, np.where(east, 0.2, 0.5), np.where(rho < 14, 0.5, np.where(east, 0.9, 0.5)))
+    picture = np.where(rho < 5, np.where(east, 0.0, 1.0), picture).astype(np.float32)
+    angles = (np.arange(32) + 0.5) * 2 * np.pi / 32
+    around, place = np.column_stack([np.cos(angles), np.sin(angles)]), np.array([[30.0, 30.0]])
+    beside = np.array([17.0, 7.0, 2.5])
+    outside, inside, apart, inwards, edge = fit_kernels.ring_sides(
+        picture, place, around, np.array([12.0]), beside, 0.1, 1e-3
+    )[0]
+    assert (outside, inside, apart) == pytest.approx((0.5, 0.5, 0.5), abs=0.07)
+    assert inwards == pytest.approx(np.log((0.25 + 1e-3) / (0.0225 + 1e-3)), abs=0.2)
+    assert edge == pytest.approx(1e-3 / (0.04 + 1e-3), rel=0.3)  # brighter outside than inside, and uneven there
+    disc = np.where(rho < 12, 0.9, 0.1).astype(np.float32)
+    assert fit_kernels.ring_sides(disc, place, around, np.array([12.0]), beside, 0.1, 1e-3)[0, 4] > 1.0
+    ring = np.where(np.abs(rho - 12) < 2, 0.9, 0.1).astype(np.float32)
+    assert fit_kernels.ring_sides(ring, place, around, np.array([12.0]), beside, 0.1, 1e-3)[0, 4] == 0.0
+
+
+def test_slopes_along_the_radii_are_those_of_a_circle():
+    x, y = np.meshgrid(np.arange(60.0), np.arange(60.0), indexing="ij")
+    angles = (np.arange(32) + 0.5) * 2 * np.pi / 32
+    around, place, edges = np.column_stack([np.cos(angles), np.sin(angles)]), np.array([[30.0, 30.0]]), np.array([12.0])
+
+    def share(gray):
+        return fit_kernels.edge_shares(*map(np.ascontiguousarray, np.gradient(gray)), place, around, edges, 1e-6)[0]
+
+    assert share(np.hypot(x - 30, y - 30)) == pytest.approx(1.0, abs=0.01)  # rings
+    assert share(x) == pytest.approx(0.5, abs=0.01)  # a ramp: along the radius in two directions, across it in two
+    assert share(np.arctan2(y - 30, x - 30)) < 0.1  # spokes
+    assert share(np.full((60, 60), 0.3)) == 0.0
 
 
 def test_shifts_of_a_ring_are_scored_by_the_sectors_that_are_free():

@@ -206,8 +206,7 @@ class ProfileConfig(_Section):
         min_support: Least share of a top that is seen, less the share of its surroundings.
         min_rim_support: The same of an open rim.
         min_rim_evidence: Least product of a rim's support and of the share of its ring that is seen in the image.
-        min_ring_votes: Least share of directions, less those against, in which the image shows a rim without points.
-        min_ring_contrast: Least mean correlation of such a rim's sectors with a ring's.
+        min_ring_odds: Least log odds of a ring that the image alone shows to be a rim (docs/method.md, "Faint rims").
         min_sectors: Least share of a top's circle whose end is seen.
         reach_m: Added to what a slot lets a tube's top reach, for the rack's error and for looser slots.
         plane_points: Points of a top that its plane is fitted to.
@@ -218,7 +217,7 @@ class ProfileConfig(_Section):
         outline_bias_m: Standard deviation of a circle's middle beyond what its sectors explain.
         rim_noise_m: As `outline_noise_m`, of the bright ring of a rim.
         rim_bias_m: As `outline_bias_m`, of the bright ring of a rim.
-        faint_rim_bias_m: The same of a rim that the image alone shows.
+        even_rim_m: Standard deviation of the middle of a rim that the image alone shows, along each of two axes.
         torn_rim_m: What is added to it, by the share of the ring's free sectors that do not look like one.
         wall_noise_m: Standard deviation of points on a wall that can be believed, a label's say.
         wall_radius_m: Standard deviation of a wall's radius.
@@ -241,8 +240,7 @@ class ProfileConfig(_Section):
     min_support: float = 0.3
     min_rim_support: float = 0.1
     min_rim_evidence: float = 0.11
-    min_ring_votes: float = 0.55
-    min_ring_contrast: float = 0.5
+    min_ring_odds: float = 1.5
     min_sectors: float = 0.4
     reach_m: float = 1.5e-3
     plane_points: int = 400
@@ -254,7 +252,7 @@ class ProfileConfig(_Section):
     widening_m: float = Field(default=3.0e-4, gt=0)
     rim_noise_m: float = 2.0e-4
     rim_bias_m: float = 5.0e-5
-    faint_rim_bias_m: float = 2.5e-4
+    even_rim_m: float = 3.2e-4
     torn_rim_m: float = 6.0e-4
     cap_height_m: float = Field(default=3.0e-4, gt=0)
     cap_tilt_rad: float = 0.0030

@@ -1,11 +1,11 @@
 """Rims that the image shows and the cloud does not: those of clear plastic, which hardly returns a point.
 
-Such a rim is a bright ring where it scatters some light back, and a dark one where it leads all of it away. The image
-is laid onto the level of the rims, where all of them are circles of one size. About every slot each place that a rim
-can have is judged by votes of directions: for a ring that is brighter than both of its sides, against one that is
-darker, nothing for an edge; and the same in the negative. The best place of a slot that wins enough of them is then
-measured as any rim is, and believed if nearly all of its circle is free to be seen and looks like a ring. Neither test
-knows of the other: the votes see whether a side is brighter and not by how much, the correlation how a ring looks.
+Such a rim has one gray all around, of the light that it scatters or leads away, while what lies behind the tube shows
+beside it: so it is brighter than that here, darker there, and has no edge where both are alike. The image is laid onto
+the level of the rims, where all of them are circles of one size. About every slot each place that a rim can have is
+judged by how even the ring is there, against its sides. The best place of a slot is believed if the ring is even
+enough, differs from both sides nearly everywhere, nearly all of its circle is free to be seen, and it is not the edge
+of a round opening.
 """
 
 from __future__ import annotations
@@ -18,25 +18,39 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tubepose.config import ProfileConfig
-from tubepose.profile.fit_kernels import ring_heights, ring_votes
+from tubepose.profile.fit_kernels import edge_shares, even_rings, ring_heights, ring_sides
 from tubepose.profile.outline import SECTORS, Circles, unknown_circles
-from tubepose.profile.rims import RimView, fit_rims, ring_contrast
+from tubepose.profile.rims import RimView
 from tubepose.profile.standing import Standing
 from tubepose.transforms import FloatArray
 
-CELL_M = 0.4e-3
-COARSE = 2
-"""Every so many cells a place is judged first; then those around the best of them."""
+CELL_M = 0.3e-3
+BLUR_CELLS = 0.7
+COARSE_M, FINE_M = 0.6e-3, 0.15e-3
+"""How far apart places are judged first, and then about the best of them."""
 DIRECTIONS = 48
+LEAST_SEEN = 0.75
+"""Least share of the directions that are in the image."""
 LEAST_FREE = 0.75
 """Least share of a circle that no other top is near to."""
-EDGE_M = 20e-3
-"""How far beyond the middles of slots the image is laid out."""
+ALONG_M, BESIDE_M, DEEPER_M = 0.25e-3, 0.5e-3, 1.2e-3
+"""How far from the middle of its wall a ring is looked at, how far beside its two edges, and how far further inside."""
+NOISE, DIFFERS, LEAST_SLOPE = 0.04, 0.02, 0.004
+"""What grays differ by where they are alike, and where they are not, as shares of the picture's range; a slope that is
+none, per cell."""
+LEAST_SIDES = 0.6
+"""Least shares of directions in which the outside and the inside differ from the ring, and one of them by more than
+the ring does from itself."""
+MOST_EDGE = 0.6
+"""A ring between both sides that varies by this much of what the outside does may be the edge of a disc or a hole."""
+LIKELY = np.array([17.1, 38.3, 5.4])
+UNLIKELY = 45.8
+"""Log odds of a rim: per evenness, share of slopes along the radii, and unevenness further inside; less this."""
+HOLE_M = 1.5e-3
+"""A ring whose middle and radius are this near those of a round opening may be that opening."""
 BIN_M = 1e-3
 ONE_HEIGHT_SHARE, ALL_AROUND = 0.6, 0.6
 """Points on a ring are at one height where three bins hold this share of them, in this share of its sectors."""
-LEAST_GRAY = 0.02
-"""Differences under this share of the picture's range are noise."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -44,22 +58,14 @@ class FaintRims:
     """What the image shows in slots, S of them.
 
     Attributes:
-        center_m: Middle of each rim before it was measured, rack frame, shape (S, 2), metres.
-        circles: The measured circles, about those middles.
-        contrast: Mean correlation of the circle's sectors with a ring's, shape (S,); -inf where no ring was found.
+        center_m: Middle of each rim, rack frame, shape (S, 2), metres.
+        circles: How well it is known, about those middles.
+        evenness: 1 less the variance of gray along the ring over that beside it, shape (S,); -inf without a rim.
     """
 
     center_m: FloatArray
     circles: Circles
-    contrast: FloatArray
-
-    def where(self, mine: NDArray[np.bool_], other: FaintRims) -> FaintRims:
-        """These rims where `mine`, shape (S,), is True, the other's elsewhere."""
-        return FaintRims(
-            np.where(mine[:, None], self.center_m, other.center_m),
-            self.circles.where(mine, other.circles),
-            np.where(mine, self.contrast, other.contrast),
-        )
+    evenness: FloatArray
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -74,6 +80,7 @@ class RimSearch:
         radii_m: Inner and outer radius of the rims, shape (2,).
         blocked_at: From middles of rims, shape (N, 2), to the sectors that other tops are too near to, (N, SECTORS).
         standing: Points above the rack's top: a ring of them at another height is a rim of something else.
+        holes_m: Round openings as seen on the level of the rims: middle and radius, (H, 3), rack frame, metres.
         config: Limits, and noise of outlines.
     """
 
@@ -84,35 +91,22 @@ class RimSearch:
     radii_m: FloatArray
     blocked_at: Callable[[FloatArray], NDArray[np.bool_]]
     standing: Standing
+    holes_m: FloatArray
     config: ProfileConfig
 
 
 def find_faint_rims(search: RimSearch) -> FaintRims:
-    """Look for a rim, bright or dark, in each of some slots."""
-    bright, dark = (
-        _measured(*likeliest, search, is_dark=is_dark)
-        for likeliest, is_dark in zip(_likeliest(search), (False, True), strict=True)
-    )
-    return bright.where(bright.contrast >= dark.contrast, dark)
-
-
-def _measured(middle: FloatArray, votes: FloatArray, search: RimSearch, *, is_dark: bool) -> FaintRims:
-    """Rings of one kind about middles (S, 2) that won enough votes (S,), measured and judged."""
-    circles, contrast = unknown_circles(len(middle)), np.full(len(middle), -np.inf)
-    at = np.flatnonzero(votes >= search.config.min_ring_votes)
+    """Look for a rim in each of some slots."""
+    center, evenness, odds = _most_even(search)
+    at = np.flatnonzero(odds >= search.config.min_ring_odds)
+    circles, told = unknown_circles(len(center)), np.full(len(center), -np.inf)
     if len(at) == 0:
-        return FaintRims(middle, circles, contrast)
-    view = search.view.negative() if is_dark else search.view
-    size = (np.full(len(at), search.level_m), np.tile(search.radii_m, (len(at), 1)))
-    found = fit_rims(
-        view, middle[at], *size, search.blocked_at(middle[at]), search.config, search.config.faint_rim_bias_m
-    )
-    place = middle[at] + np.nan_to_num(found.offset_m)
-    blocked = search.blocked_at(place)
-    seen = np.isfinite(found.offset_m[:, 0]) & ((~blocked).mean(axis=1) >= LEAST_FREE)
-    seen &= ~_at_another_height(place, search)
-    contrast[at] = np.where(seen, ring_contrast(view, place, *size, blocked), -np.inf)
-    return FaintRims(middle, circles.put(at, found), contrast)
+        return FaintRims(center, circles, told)
+    free = (~search.blocked_at(center[at])).mean(axis=1)
+    seen = (free >= LEAST_FREE) & ~_at_another_height(center[at], search) & ~_is_a_hole(center[at], search)
+    known = np.tile(np.eye(2) * search.config.even_rim_m**2, (len(at), 1, 1))
+    told[at] = np.where(seen, evenness[at], -np.inf)
+    return FaintRims(center, circles.put(at, Circles(np.zeros((len(at), 2)), known, np.zeros(len(at)), free)), told)
 
 
 def _at_another_height(center_m: FloatArray, search: RimSearch) -> NDArray[np.bool_]:
@@ -138,34 +132,54 @@ def _at_another_height(center_m: FloatArray, search: RimSearch) -> NDArray[np.bo
     return np.asarray(one_height & ((most > 0).mean(axis=1) >= ALL_AROUND) & ~expected)
 
 
-def _likeliest(search: RimSearch) -> list[tuple[FloatArray, FloatArray]]:
-    """Place of each slot with most votes, (S, 2), metres, and the votes, (S,), -1 to 1: for bright, then dark rings."""
-    low, high = search.center_m.min(axis=0) - EDGE_M, search.center_m.max(axis=0) + EDGE_M
-    picture = _laid_out(search.view, low, high, search.level_m)
+def _is_a_hole(center_m: FloatArray, search: RimSearch) -> NDArray[np.bool_]:
+    """Which rings may be the edge of a round opening of the rack, shape (N,)."""
+    as_large = np.abs(search.holes_m[:, 2] - search.radii_m.mean()) < HOLE_M
+    apart = np.linalg.norm(center_m[:, None] - search.holes_m[as_large, :2], axis=2)
+    return np.asarray((apart < HOLE_M).any(axis=1))
+
+
+def _most_even(search: RimSearch) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Place of each slot's most even ring, (S, 2), metres; its evenness, (S,), and log odds of being a rim, (S,)."""
+    inner, outer = search.radii_m
+    edge_m = search.reach_m + COARSE_M + outer + BESIDE_M + 3 * CELL_M
+    low, high = search.center_m.min(axis=0) - edge_m, search.center_m.max(axis=0) + edge_m
+    picture = _of_unit_range(_laid_out(search.view, low, high, search.level_m))
     angles = (np.arange(DIRECTIONS) + 0.5) * (2 * np.pi / DIRECTIONS)
     around = np.column_stack([np.cos(angles), np.sin(angles)])
-    middle_m, width_m = float(np.mean(search.radii_m)), float(np.ptp(search.radii_m))
-    ring, inside, outside = (
-        np.rint((middle_m + step) / CELL_M * around).astype(np.intp) for step in (0.0, -width_m, width_m)
-    )
-    seen = picture[np.isfinite(picture)]
-    circles = (ring, inside, outside, LEAST_GRAY * float(np.ptp(seen) if len(seen) else 0.0) + 1e-6)
-    middle, near = _disc(search.reach_m, COARSE), _disc(COARSE * CELL_M, 1)
-    start = np.rint((search.center_m - low) / CELL_M).astype(np.intp)
-    _, best = ring_votes(picture, start, middle, *circles)
-    found = []
-    for kind in range(2):
-        cells = start + middle[best[:, kind]]
-        votes, better = ring_votes(picture, cells, near, *circles)
-        found.append((low + (cells + near[better[:, kind]]) * CELL_M, votes[:, kind]))
-    return found
+    ring = (np.array([-ALONG_M, 0.0, ALONG_M]) + (inner + outer) / 2) / CELL_M
+    beside = np.array([outer + BESIDE_M, inner - BESIDE_M, inner - DEEPER_M]) / CELL_M
+    place, shifts = (search.center_m - low) / CELL_M, _disc(search.reach_m, COARSE_M)
+    # Half of the directions and one radius tell where to look.
+    half = np.ascontiguousarray(around[::2])
+    sides = (beside[0], beside[1])
+    _, best = even_rings(picture, place, shifts, half, ring[1:2], *sides, LEAST_SEEN * len(half), NOISE**2)
+    place, shifts = place + shifts[best], _disc(COARSE_M, FINE_M)
+    evenness, best = even_rings(picture, place, shifts, around, ring, *sides, LEAST_SEEN * DIRECTIONS, NOISE**2)
+    place = place + shifts[best]
+    like = ring_sides(picture, place, around, ring, beside, DIFFERS, NOISE**2)
+    slopes = [cv2.Sobel(picture, cv2.CV_32F, dx, 1 - dx, ksize=3, scale=1 / 8) for dx in (0, 1)]
+    edges = (np.array([inner, outer])[:, None] + np.array([-1, 0, 1]) * ALONG_M).ravel() / CELL_M
+    along = edge_shares(slopes[0], slopes[1], place, around, edges, LEAST_SLOPE)
+    odds = np.column_stack([evenness, along, np.clip(like[:, 3], -1, 1)]) @ LIKELY - UNLIKELY
+    odds[~np.isfinite(evenness) | np.any(like[:, :3] < LEAST_SIDES, axis=1) | (like[:, 4] > MOST_EDGE)] = -np.inf
+    return low + place * CELL_M, evenness, odds
 
 
-def _disc(reach_m: float, step: int) -> NDArray[np.intp]:
-    """Every `step`-th cell of a disc, (M, 2), the middle among them."""
-    axis = step * np.arange(-int(reach_m / CELL_M / step), int(reach_m / CELL_M / step) + 1)
-    cells = np.stack(np.meshgrid(axis, axis), axis=-1).reshape(-1, 2)
-    return np.asarray(cells[np.hypot(*cells.T) * CELL_M <= reach_m + 1e-9], np.intp)
+def _of_unit_range(picture: NDArray[np.float32]) -> NDArray[np.float32]:
+    """A picture, a little blurred, over the range of most of its grays: a lamp's reflection is no part of it."""
+    picture = np.asarray(cv2.GaussianBlur(picture, (0, 0), BLUR_CELLS), np.float32)
+    some = picture[::5, ::5]
+    seen = some[np.isfinite(some)]
+    lowest, dark, bright, highest = np.percentile(seen, (0, 1, 99, 100)) if len(seen) else (0.0, 0.0, 0.0, 1.0)
+    return np.asarray(picture / np.float32(max(bright - dark, 0.2 * (highest - lowest), 1e-6)), np.float32)
+
+
+def _disc(reach_m: float, step_m: float) -> FloatArray:
+    """Places of a disc, `step_m` apart, (M, 2), cells, the middle among them."""
+    axis = step_m * np.arange(-int(reach_m / step_m), int(reach_m / step_m) + 1)
+    places = np.stack(np.meshgrid(axis, axis), axis=-1).reshape(-1, 2)
+    return np.asarray(places[np.hypot(*places.T) <= reach_m + 1e-9] / CELL_M)
 
 
 def _laid_out(view: RimView, low_m: FloatArray, high_m: FloatArray, level_m: float) -> NDArray[np.float32]:
@@ -174,11 +188,20 @@ def _laid_out(view: RimView, low_m: FloatArray, high_m: FloatArray, level_m: flo
     lens, R, t = view.intrinsics, view.T_camera_rack[:3, :3], view.T_camera_rack[:3, 3]
     K = np.array([[lens.fx, 0, lens.cx], [0, lens.fy, lens.cy], [0, 0, 1.0]])
     # A column of the picture goes along the rack's y, a row along its x.
-    to_camera = np.column_stack([R[:, 1] * CELL_M, R[:, 0] * CELL_M, R @ [*low_m, level_m] + t])
+    to_image = K @ np.column_stack([R[:, 1] * CELL_M, R[:, 0] * CELL_M, R @ [*low_m, level_m] + t])
+    corners = to_image @ np.array([[0, columns, 0, columns], [0, 0, rows, rows], [1, 1, 1, 1.0]])
+    size = view.picture.shape[1::-1]
+    first, end = np.zeros(2, int), np.array(size)
+    if np.all(corners[2] > 0):  # only this part of the image is read
+        ends = corners[:2] / corners[2]
+        first = np.clip(np.floor(ends.min(axis=1)).astype(int) - 1, 0, size)
+        end = np.clip(np.ceil(ends.max(axis=1)).astype(int) + 2, 0, size)
+    if np.any(end - first < 2):
+        return np.full((rows, columns), np.nan, np.float32)
     return np.asarray(
         cv2.warpPerspective(
-            np.asarray(view.picture, np.float32),
-            K @ to_camera,
+            np.asarray(view.picture[first[1] : end[1], first[0] : end[0]], np.float32),
+            np.array([[1, 0, -first[0]], [0, 1, -first[1]], [0, 0, 1.0]]) @ to_image,
             (columns, rows),
             flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP,
             borderValue=float("nan"),

@@ -135,34 +135,107 @@ def wall_sums(residual_m, normal, above_m, of, pose, weight, near_m):
 
 
 @compiled
-def ring_votes(picture, cells, shifts, ring, inside, outside, least):
-    """Most votes (S, 2) for a bright and for a dark ring about cells (S, 2), and with which of the shifts (M, 2) each.
+def between(picture, x, y):
+    """A picture between its cells (bilinear), at a place well inside of it."""
+    i, j = int(x), int(y)
+    right, up = x - i, y - j
+    lower = picture[i, j] + up * (picture[i, j + 1] - picture[i, j])
+    upper = picture[i + 1, j] + up * (picture[i + 1, j + 1] - picture[i + 1, j])
+    return lower + right * (upper - lower)
 
-    `ring`, `inside` and `outside` are cells (D, 2) of directions from a middle. A direction votes by how much brighter
-    its cell on the ring is than the two beside it, over their differences, a least one included: 1 if it is brighter
-    than both, -1 if darker, near 0 on an edge. Directions that leave the picture, or meet a NaN, do not vote.
+
+@compiled
+def even_rings(picture, places, shifts, around, ring, outside, inside, least_seen, noise):
+    """Evenness (S,) of the most even ring about places (S, 2), and which of the shifts (M, 2) has it (S,).
+
+    A ring is even where it has one gray along its directions `around` (D, 2), at the radii `ring` (R,), and what lies
+    beside it, at the radii `outside` and `inside`, has others: 1 less the variance along it over that beside it, about
+    the ring's mean, the outside counted twice; noise has a variance of its own. Directions that meet a NaN do not
+    count; with fewer than `least_seen` of them there is no ring, nor where one leaves the picture.
     """
-    votes, best = np.full((len(cells), 2), -1.0), np.zeros((len(cells), 2), np.intp)
-    height, width = picture.shape
-    for s in range(len(cells)):
+    evenness, best = np.full(len(places), -np.inf), np.zeros(len(places), np.intp)
+    for s in range(len(places)):
         for m in range(len(shifts)):
-            i, j = cells[s, 0] + shifts[m, 0], cells[s, 1] + shifts[m, 1]
-            total = 0.0
-            for d in range(len(ring)):
-                if not (0 <= i + outside[d, 0] < height and 0 <= j + outside[d, 1] < width):
-                    continue
-                middle = picture[i + ring[d, 0], j + ring[d, 1]]
-                inner = middle - picture[i + inside[d, 0], j + inside[d, 1]]
-                outer = middle - picture[i + outside[d, 0], j + outside[d, 1]]
-                vote = (inner + outer) / (abs(inner) + abs(outer) + least)
-                if vote == vote:
-                    total += vote
-            share = total / len(ring)
-            if share > votes[s, 0]:
-                votes[s, 0], best[s, 0] = share, m
-            if -share > votes[s, 1]:
-                votes[s, 1], best[s, 1] = -share, m
-    return votes, best
+            x, y = places[s, 0] + shifts[m, 0], places[s, 1] + shifts[m, 1]
+            if not (outside < min(x, y) and max(x - picture.shape[0], y - picture.shape[1]) < -outside - 2.0):
+                continue
+            seen, own, own2, outer, outer2, inner, inner2 = 0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+            for d in range(len(around)):
+                right, up = around[d, 0], around[d, 1]
+                beyond = between(picture, x + outside * right, y + outside * up)
+                within = between(picture, x + inside * right, y + inside * up)
+                along, along2 = 0.0, 0.0
+                for radius in ring:
+                    value = between(picture, x + radius * right, y + radius * up)
+                    along += value
+                    along2 += value * value
+                if math.isfinite(beyond + within + along):
+                    seen += 1
+                    own, own2 = own + along, own2 + along2
+                    outer, outer2 = outer + beyond, outer2 + beyond * beyond
+                    inner, inner2 = inner + within, inner2 + within * within
+            if seen < least_seen:
+                continue
+            gray, own2 = own / (seen * len(ring)), own2 / (seen * len(ring))
+            apart = (outer2 - 2.0 * gray * outer) / seen + gray * gray + noise
+            deep = (inner2 - 2.0 * gray * inner) / seen + gray * gray + noise
+            even = 1.0 - (own2 - gray * gray + noise) / (apart * apart * deep) ** (1.0 / 3.0)
+            if even > evenness[s]:
+                evenness[s], best[s] = even, m
+    return evenness, best
+
+
+@compiled
+def ring_sides(picture, places, around, ring, beside, differs, noise):
+    """What rings about places (S, 2) are like beside them, shape (S, 5); arguments are those of `even_rings`.
+
+    Shares of directions whose outside differs from the ring's median gray, and whose inside does, both by more than
+    `differs`; and where one of them does by more than the ring's own standard deviation. Then the logarithm of how much
+    less even the gray is at the last of the radii `beside` (outside, inside, further inside) than at the one before.
+    Last, where the ring's gray lies between those of its sides, as on an edge, the variance along it over that of the
+    outside; else 0.
+    """
+    found = np.zeros((len(places), 5))
+    along, sides = np.empty((len(around), len(ring))), np.empty((len(around), 3))
+    for s in range(len(places)):
+        for d in range(len(around)):
+            right, up = around[d, 0], around[d, 1]
+            for r in range(len(ring)):
+                along[d, r] = between(picture, places[s, 0] + ring[r] * right, places[s, 1] + ring[r] * up)
+            for r in range(3):
+                sides[d, r] = between(picture, places[s, 0] + beside[r] * right, places[s, 1] + beside[r] * up)
+        gray = np.nanmedian(along)
+        scatter = math.sqrt(np.nanmean((along - gray) ** 2))
+        for d in range(len(around)):
+            outer, inner = abs(sides[d, 0] - gray), abs(sides[d, 1] - gray)
+            found[s, 0] += (outer > differs) / len(around)
+            found[s, 1] += (inner > differs) / len(around)
+            found[s, 2] += (max(outer, inner) > scatter) / len(around)
+        found[s, 3] = math.log((np.nanvar(sides[:, 2]) + noise) / (np.nanvar(sides[:, 1]) + noise))
+        if (np.nanmean(sides[:, 0]) - gray) * (gray - np.nanmean(sides[:, 1])) > 0.0:
+            found[s, 4] = (scatter * scatter + noise) / (np.nanvar(sides[:, 0]) + noise)
+    return found
+
+
+@compiled
+def edge_shares(slope_x, slope_y, places, around, edges, least):
+    """How much of the slopes of gray at edges of circles about places (S, 2) is along their radii, 0 to 1, shape (S,).
+
+    Of every direction (D, 2) the largest share ``(n . g)^2 / (|g|^2 + least^2)`` at the radii `edges` (R,) counts.
+    """
+    shares = np.zeros(len(places))
+    for s in range(len(places)):
+        for d in range(len(around)):
+            most = 0.0
+            for radius in edges:
+                x, y = places[s, 0] + radius * around[d, 0], places[s, 1] + radius * around[d, 1]
+                across, along = between(slope_x, x, y), between(slope_y, x, y)
+                radial = across * around[d, 0] + along * around[d, 1]
+                share = radial * radial / (across * across + along * along + least * least)
+                if share > most:  # False for NaN
+                    most = share
+            shares[s] += most / len(around)
+    return shares
 
 
 @compiled

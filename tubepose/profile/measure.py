@@ -19,6 +19,7 @@ from tubepose.profile.plane import TopPlanes, fit_top_planes
 from tubepose.profile.rims import RimView, fit_rims, rim_view
 from tubepose.profile.standing import Standing, gather_standing
 from tubepose.profile.tops import (
+    OVERLAP,
     Tops,
     find_tops,
     joined,
@@ -36,6 +37,8 @@ ON_PLANE_M = 5.0e-4
 DISC_GAP_M = 0.9e-3
 RIM_GAP_M = 0.6e-3
 """Where another top is nearer than this, the end of a disc (the ring of a rim) is not told from the other's."""
+LEAST_WHOLE = 0.75
+"""Of a rim's sectors that no other top is near to at least this share looks like a ring where it is whole."""
 LABEL_CELL_M = 5.0e-4
 RING_SUPPORT = 0.6
 """Points with this much support are a rim whatever the image shows."""
@@ -102,7 +105,12 @@ def measure_tops(
     kept |= rims.sectors * tops.support >= config.profile.min_rim_evidence
     tops, rims = tops.take(kept), rims.take(kept)
     if view is not None and view.is_image:
-        tops, rims = _with_faint_rims(view, tops, rims, standing, rack, tubes, config.profile, allowed)
+        torn = _torn(tops, rims, _shapes(tops, tubes, rack), config.profile)
+        rest = (tops.take(torn), rims.take(torn))
+        found = _with_faint_rims(
+            view, tops.take(~torn), rims.take(~torn), standing, rack, tubes, config.profile, allowed
+        )
+        tops, rims = _with_others(*found, *rest, tubes)
     shape = _shapes(tops, tubes, rack)
     label = label_points(standing, tops.center_m, shape.radius_m)
     planes, discs = _measure_closed(standing, label, tops, shape, config.profile)
@@ -141,6 +149,26 @@ def _measure_rims(view: RimView | None, tops: Tops, shape: _Shapes, config: Prof
     return circles.put(at, rims)
 
 
+def _torn(tops: Tops, rims: Circles, shape: _Shapes, config: ProfileConfig) -> NDArray[np.bool_]:
+    """Rims of which so little looks like a ring, shape (T,), that a ring of one gray nearby may be the right one."""
+    sure = tops.support >= config.min_support
+    free = ~blocked_sectors(tops.center_m, shape.radius_m, RIM_GAP_M, sure)
+    return np.asarray(shape.open & (rims.sectors * SECTORS < LEAST_WHOLE * free.sum(axis=1)))
+
+
+def _with_others(
+    tops: Tops, rims: Circles, other: Tops, other_rims: Circles, tubes: Sequence[TubeModel]
+) -> tuple[Tops, Circles]:
+    """The same tops and circles, and those of others whose slots are left and that overlap none of them."""
+    left = ~np.isin(other.slot, tops.slot)
+    radius_m = np.array([top_radius_m(tube) for tube in tubes])
+    apart = np.linalg.norm(other.center_m[:, None] - tops.center_m[None], axis=2)
+    left &= np.all(apart > OVERLAP * (radius_m[other.tube][:, None] + radius_m[tops.tube]), axis=1)
+    tops, rims = joined(tops, other.take(left)), joined(rims, other_rims.take(left))
+    order = np.argsort(tops.slot, kind="stable")
+    return tops.take(order), rims.take(order)
+
+
 def _with_faint_rims(
     view: RimView,
     tops: Tops,
@@ -163,25 +191,33 @@ def _with_faint_rims(
         reach_m = max(top_reach_m(rack.all_slots[i], tube, rack) for i in free)
         search = RimSearch(
             view, rack.slot_centers_m[free], reach_m, top_level_m(tube, rack), radii,
-            partial(_blocked_by, *known, float(radii[1])), standing, config,
+            partial(_blocked_by, *known, float(radii[1])), standing, _holes_m(rack, standing, top_level_m(tube, rack)),
+            config,
         )  # fmt: skip
         seen.append(find_faint_rims(search))
-    contrast = np.stack([one.contrast for one in seen])
+    evenness = np.stack([one.evenness for one in seen])
     if allowed is not None:
-        contrast = np.where(allowed[np.ix_(types, free)], contrast, -np.inf)
-    best, ranked = contrast.argmax(axis=0), np.sort(contrast, axis=0)
+        evenness = np.where(allowed[np.ix_(types, free)], evenness, -np.inf)
+    best, ranked = evenness.argmax(axis=0), np.sort(evenness, axis=0)
     kind, place = np.full(len(rack.all_slots), -1), np.full((len(rack.all_slots), 3), -np.inf)
     kind[tops.slot], place[tops.slot, 1:] = tops.tube, tops.center_m
     kind[free], place[free, 0] = types[best], ranked[-1]
     place[free, 1:] = np.stack([one.center_m for one in seen])[best, np.arange(len(free))]
-    chosen = without_overlaps(free[ranked[-1] >= config.min_ring_contrast], tops.slot, kind, place, tubes)
+    chosen = without_overlaps(free[np.isfinite(ranked[-1])], tops.slot, kind, place, tubes)
     at = np.searchsorted(free, chosen)
     second = ranked[-2, at] if len(types) > 1 else np.full(len(at), -np.inf)
     new = Tops(chosen, kind[chosen], place[chosen, 1:], place[chosen, 0], second)
     circles = [one.circles.take(at) for one in seen]
     found = reduce(lambda low, k: circles[k].where(best[at] == k, low), range(1, len(types)), circles[0])
-    order = np.argsort(np.concatenate([tops.slot, chosen]), kind="stable")
-    return joined(tops, new).take(order), joined(rims, found).take(order)
+    return joined(tops, new), joined(rims, found)
+
+
+def _holes_m(rack: RackModel, standing: Standing, level_m: float) -> FloatArray:
+    """A rack's round openings as the camera sees them on a level: middle and radius, shape (H, 3), metres."""
+    holes = [(*slot.center_m, rack.height_m, slot.half_size_m[0]) for slot in rack.all_slots if slot.shape == "round"]
+    tops = np.array(holes).reshape(-1, 4)
+    smaller = (standing.camera_m[2] - level_m) / (standing.camera_m[2] - rack.height_m)
+    return np.column_stack([standing.on_level(level_m, tops[:, :3]), tops[:, 3] * smaller])
 
 
 def _blocked_by(center_m: FloatArray, radius_m: FloatArray, own_m: float, place_m: FloatArray) -> NDArray[np.bool_]:
