@@ -217,7 +217,9 @@ class ProfileConfig(_Section):
         outline_bias_m: Standard deviation of a circle's middle beyond what its sectors explain.
         rim_noise_m: As `outline_noise_m`, of the bright ring of a rim.
         rim_bias_m: As `outline_bias_m`, of the bright ring of a rim.
-        even_rim_m: Standard deviation of the middle of a rim that the image alone shows, along each of two axes.
+        faint_rim_bias_m: The same of a rim that the image alone shows.
+        even_rim_m: Standard deviation of the middle of such a rim where it is neither a bright ring nor a dark one.
+        lone_rim_m: What is added to that of a torn ring that is not found again as one of even gray.
         torn_rim_m: What is added to it, by the share of the ring's free sectors that do not look like one.
         wall_noise_m: Standard deviation of points on a wall that can be believed, a label's say.
         wall_radius_m: Standard deviation of a wall's radius.
@@ -252,7 +254,9 @@ class ProfileConfig(_Section):
     widening_m: float = Field(default=3.0e-4, gt=0)
     rim_noise_m: float = 2.0e-4
     rim_bias_m: float = 5.0e-5
+    faint_rim_bias_m: float = 2.0e-4
     even_rim_m: float = 3.2e-4
+    lone_rim_m: float = 8.0e-4
     torn_rim_m: float = 6.0e-4
     cap_height_m: float = Field(default=3.0e-4, gt=0)
     cap_tilt_rad: float = 0.0030

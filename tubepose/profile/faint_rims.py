@@ -5,7 +5,8 @@ beside it: so it is brighter than that here, darker there, and has no edge where
 the level of the rims, where all of them are circles of one size. About every slot each place that a rim can have is
 judged by how even the ring is there, against its sides. The best place of a slot is believed if the ring is even
 enough, differs from both sides nearly everywhere, nearly all of its circle is free to be seen, and it is not the edge
-of a round opening.
+of a round opening. Where it looks like a bright or a dark ring as well it is measured as one; elsewhere its middle is
+where it is most even.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ from numpy.typing import NDArray
 from tubepose.config import ProfileConfig
 from tubepose.profile.fit_kernels import edge_shares, even_rings, ring_heights, ring_sides
 from tubepose.profile.outline import SECTORS, Circles, unknown_circles
-from tubepose.profile.rims import RimView
+from tubepose.profile.rims import RimView, fit_rims, ring_contrast
 from tubepose.profile.standing import Standing
 from tubepose.transforms import FloatArray
 
@@ -46,6 +47,8 @@ MOST_EDGE = 0.6
 LIKELY = np.array([17.1, 38.3, 5.4])
 UNLIKELY = 45.8
 """Log odds of a rim: per evenness, share of slopes along the radii, and unevenness further inside; less this."""
+LEAST_CONTRAST = 0.7
+"""Mean correlation of its sectors with a ring's from which a rim is measured as a bright or a dark ring."""
 HOLE_M = 1.5e-3
 """A ring whose middle and radius are this near those of a round opening may be that opening."""
 BIN_M = 1e-3
@@ -58,8 +61,8 @@ class FaintRims:
     """What the image shows in slots, S of them.
 
     Attributes:
-        center_m: Middle of each rim, rack frame, shape (S, 2), metres.
-        circles: How well it is known, about those middles.
+        center_m: Middle of each rim before it was measured, rack frame, shape (S, 2), metres.
+        circles: The measured circles, about those middles.
         evenness: 1 less the variance of gray along the ring over that beside it, shape (S,); -inf without a rim.
     """
 
@@ -104,9 +107,27 @@ def find_faint_rims(search: RimSearch) -> FaintRims:
         return FaintRims(center, circles, told)
     free = (~search.blocked_at(center[at])).mean(axis=1)
     seen = (free >= LEAST_FREE) & ~_at_another_height(center[at], search) & ~_is_a_hole(center[at], search)
-    known = np.tile(np.eye(2) * search.config.even_rim_m**2, (len(at), 1, 1))
     told[at] = np.where(seen, evenness[at], -np.inf)
-    return FaintRims(center, circles.put(at, Circles(np.zeros((len(at), 2)), known, np.zeros(len(at)), free)), told)
+    return FaintRims(center, circles.put(at, _measured(center[at], free, search)), told)
+
+
+def _measured(center_m: FloatArray, free: FloatArray, search: RimSearch) -> Circles:
+    """Circles about even rings (N, 2), of which a share (N,) is free: as rings where they look like one, else as found.
+
+    As a bright ring where it is one, or a dark one.
+    """
+    count, config = len(center_m), search.config
+    even = np.tile(np.eye(2) * config.even_rim_m**2, (count, 1, 1))
+    circles, best = Circles(np.zeros((count, 2)), even, np.zeros(count), free), np.full(count, LEAST_CONTRAST)
+    size = (np.full(count, search.level_m), np.tile(search.radii_m, (count, 1)))
+    blocked = search.blocked_at(center_m)
+    for view in (search.view, search.view.negative()):
+        found = fit_rims(view, center_m, *size, blocked, config, config.faint_rim_bias_m)
+        place = center_m + np.nan_to_num(found.offset_m)
+        contrast = ring_contrast(view, place, *size, search.blocked_at(place))
+        better = np.isfinite(found.offset_m[:, 0]) & (contrast >= best)
+        circles, best = found.where(better, circles), np.where(better, contrast, best)
+    return circles
 
 
 def _at_another_height(center_m: FloatArray, search: RimSearch) -> NDArray[np.bool_]:

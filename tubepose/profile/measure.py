@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial, reduce
 
 import numpy as np
@@ -106,7 +106,7 @@ def measure_tops(
     tops, rims = tops.take(kept), rims.take(kept)
     if view is not None and view.is_image:
         torn = _torn(tops, rims, _shapes(tops, tubes, rack), config.profile)
-        rest = (tops.take(torn), rims.take(torn))
+        rest = (tops.take(torn), _less_sure(rims.take(torn), config.profile.lone_rim_m))
         found = _with_faint_rims(
             view, tops.take(~torn), rims.take(~torn), standing, rack, tubes, config.profile, allowed
         )
@@ -154,6 +154,11 @@ def _torn(tops: Tops, rims: Circles, shape: _Shapes, config: ProfileConfig) -> N
     sure = tops.support >= config.min_support
     free = ~blocked_sectors(tops.center_m, shape.radius_m, RIM_GAP_M, sure)
     return np.asarray(shape.open & (rims.sectors * SECTORS < LEAST_WHOLE * free.sum(axis=1)))
+
+
+def _less_sure(rims: Circles, more_m: float) -> Circles:
+    """The same circles with a standard deviation more along each axis, metres."""
+    return replace(rims, covariance_m2=rims.covariance_m2 + np.eye(2) * more_m**2)
 
 
 def _with_others(
