@@ -39,6 +39,7 @@ ALONG_M, BESIDE_M, DEEPER_M = 0.25e-3, 0.5e-3, 1.2e-3
 NOISE, DIFFERS, LEAST_SLOPE = 0.04, 0.02, 0.004
 """What grays differ by where they are alike, and where they are not, as shares of the picture's range; a slope that is
 none, per cell."""
+LEAST_EVENNESS = 0.5
 LEAST_SIDES = 0.6
 """Least shares of directions in which the outside and the inside differ from the ring, and one of them by more than
 the ring does from itself."""
@@ -179,11 +180,14 @@ def _most_even(search: RimSearch) -> tuple[FloatArray, FloatArray, FloatArray]:
     evenness, best = even_rings(picture, place, shifts, around, ring, *sides, LEAST_SEEN * DIRECTIONS, NOISE**2)
     place = place + shifts[best]
     like = ring_sides(picture, place, around, ring, beside, DIFFERS, NOISE**2)
-    slopes = [cv2.Sobel(picture, cv2.CV_32F, dx, 1 - dx, ksize=3, scale=1 / 8) for dx in (0, 1)]
-    edges = (np.array([inner, outer])[:, None] + np.array([-1, 0, 1]) * ALONG_M).ravel() / CELL_M
-    along = edge_shares(slopes[0], slopes[1], place, around, edges, LEAST_SLOPE)
-    odds = np.column_stack([evenness, along, np.clip(like[:, 3], -1, 1)]) @ LIKELY - UNLIKELY
-    odds[~np.isfinite(evenness) | np.any(like[:, :3] < LEAST_SIDES, axis=1) | (like[:, 4] > MOST_EDGE)] = -np.inf
+    maybe = (evenness >= LEAST_EVENNESS) & np.all(like[:, :3] >= LEAST_SIDES, axis=1) & (like[:, 4] <= MOST_EDGE)
+    odds = np.full(len(place), -np.inf)
+    if maybe.any():
+        slopes = [cv2.Sobel(picture, cv2.CV_32F, dx, 1 - dx, ksize=3, scale=1 / 8) for dx in (0, 1)]
+        edges = (np.array([inner, outer])[:, None] + np.array([-1, 0, 1]) * ALONG_M).ravel() / CELL_M
+        along = edge_shares(slopes[0], slopes[1], place[maybe], around, edges, LEAST_SLOPE)
+        facts = np.column_stack([evenness[maybe], along, np.clip(like[maybe, 3], -1, 1)])
+        odds[maybe] = facts @ LIKELY - UNLIKELY
     return low + place * CELL_M, evenness, odds
 
 
