@@ -45,8 +45,8 @@ LEAST_SIDES = 0.6
 the ring does from itself."""
 MOST_EDGE = 0.6
 """A ring between both sides that varies by this much of what the outside does may be the edge of a disc or a hole."""
-LIKELY = np.array([17.1, 38.3, 5.4])
-UNLIKELY = 45.8
+LIKELY = np.array([22.2, 44.4, 6.9])
+UNLIKELY = 54.8
 """Log odds of a rim: per evenness, share of slopes along the radii, and unevenness further inside; less this."""
 LEAST_CONTRAST = 0.7
 """Mean correlation of its sectors with a ring's from which a rim is measured as a bright or a dark ring."""
@@ -70,6 +70,27 @@ class FaintRims:
     center_m: FloatArray
     circles: Circles
     evenness: FloatArray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class EvenRings:
+    """The most even ring of each of some slots, S of them.
+
+    Attributes:
+        center_m: Its middle, rack frame, shape (S, 2), metres.
+        evenness: 1 less the variance of gray along it over that beside it, shape (S,); -inf where none is in the image.
+        facts: Evenness, share of the slopes at its edges that are along its radii, and how much less even it is further
+            inside, shape (S, 3); NaN where its sides say that it is no rim.
+    """
+
+    center_m: FloatArray
+    evenness: FloatArray
+    facts: FloatArray
+
+    @property
+    def odds(self) -> FloatArray:
+        """Log odds of being rims, shape (S,), -inf for none; by `python -m benchmarks.rims`."""
+        return np.asarray(np.nan_to_num(self.facts @ LIKELY - UNLIKELY, nan=-np.inf))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -101,13 +122,14 @@ class RimSearch:
 
 def find_faint_rims(search: RimSearch) -> FaintRims:
     """Look for a rim in each of some slots."""
-    center, evenness, odds = _most_even(search)
-    at = np.flatnonzero(odds >= search.config.min_ring_odds)
+    rings = most_even(search)
+    center, evenness = rings.center_m, rings.evenness
+    at = np.flatnonzero(rings.odds >= search.config.min_ring_odds)
     circles, told = unknown_circles(len(center)), np.full(len(center), -np.inf)
     if len(at) == 0:
         return FaintRims(center, circles, told)
     free = (~search.blocked_at(center[at])).mean(axis=1)
-    seen = (free >= LEAST_FREE) & ~_at_another_height(center[at], search) & ~_is_a_hole(center[at], search)
+    seen = (free >= LEAST_FREE) & ~_at_another_height(center[at], search) & ~is_a_hole(center[at], search)
     told[at] = np.where(seen, evenness[at], -np.inf)
     return FaintRims(center, circles.put(at, _measured(center[at], free, search)), told)
 
@@ -154,15 +176,15 @@ def _at_another_height(center_m: FloatArray, search: RimSearch) -> NDArray[np.bo
     return np.asarray(one_height & ((most > 0).mean(axis=1) >= ALL_AROUND) & ~expected)
 
 
-def _is_a_hole(center_m: FloatArray, search: RimSearch) -> NDArray[np.bool_]:
+def is_a_hole(center_m: FloatArray, search: RimSearch) -> NDArray[np.bool_]:
     """Which rings may be the edge of a round opening of the rack, shape (N,)."""
     as_large = np.abs(search.holes_m[:, 2] - search.radii_m.mean()) < HOLE_M
     apart = np.linalg.norm(center_m[:, None] - search.holes_m[as_large, :2], axis=2)
     return np.asarray((apart < HOLE_M).any(axis=1))
 
 
-def _most_even(search: RimSearch) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Place of each slot's most even ring, (S, 2), metres; its evenness, (S,), and log odds of being a rim, (S,)."""
+def most_even(search: RimSearch) -> EvenRings:
+    """Look for the most even ring within the reach of every slot."""
     inner, outer = search.radii_m
     edge_m = search.reach_m + COARSE_M + outer + BESIDE_M + 3 * CELL_M
     low, high = search.center_m.min(axis=0) - edge_m, search.center_m.max(axis=0) + edge_m
@@ -181,14 +203,13 @@ def _most_even(search: RimSearch) -> tuple[FloatArray, FloatArray, FloatArray]:
     place = place + shifts[best]
     like = ring_sides(picture, place, around, ring, beside, DIFFERS, NOISE**2)
     maybe = (evenness >= LEAST_EVENNESS) & np.all(like[:, :3] >= LEAST_SIDES, axis=1) & (like[:, 4] <= MOST_EDGE)
-    odds = np.full(len(place), -np.inf)
+    facts = np.full((len(place), len(LIKELY)), np.nan)
     if maybe.any():
         slopes = [cv2.Sobel(picture, cv2.CV_32F, dx, 1 - dx, ksize=3, scale=1 / 8) for dx in (0, 1)]
         edges = (np.array([inner, outer])[:, None] + np.array([-1, 0, 1]) * ALONG_M).ravel() / CELL_M
         along = edge_shares(slopes[0], slopes[1], place[maybe], around, edges, LEAST_SLOPE)
-        facts = np.column_stack([evenness[maybe], along, np.clip(like[maybe, 3], -1, 1)])
-        odds[maybe] = facts @ LIKELY - UNLIKELY
-    return low + place * CELL_M, evenness, odds
+        facts[maybe] = np.column_stack([evenness[maybe], along, np.clip(like[maybe, 3], -1, 1)])
+    return EvenRings(low + place * CELL_M, evenness, facts)
 
 
 def _of_unit_range(picture: NDArray[np.float32]) -> NDArray[np.float32]:
