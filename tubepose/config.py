@@ -242,7 +242,7 @@ class ProfileConfig(_Section):
     min_support: float = 0.3
     min_rim_support: float = 0.1
     min_rim_evidence: float = 0.11
-    min_ring_odds: float = 2.0
+    min_ring_odds: float = 1.5
     min_sectors: float = 0.4
     reach_m: float = 1.5e-3
     plane_points: int = 400

@@ -5,8 +5,8 @@ beside it: so it is brighter than that here, darker there, and has no edge where
 the level of the rims, where all of them are circles of one size. About every slot each place that a rim can have is
 judged by how even the ring is there, against its sides. The best place of a slot is believed if the ring is even
 enough, differs from both sides nearly everywhere, nearly all of its circle is free to be seen, and it is not the edge
-of a round opening. Where it looks like a bright or a dark ring as well it is measured as one; elsewhere its middle is
-where it is most even.
+of a round opening; or if it looks like a bright or a dark ring, as one of which it is then measured. Elsewhere its
+middle is where it is most even.
 """
 
 from __future__ import annotations
@@ -48,8 +48,8 @@ MOST_EDGE = 0.6
 LIKELY = np.array([22.2, 44.4, 6.9])
 UNLIKELY = 54.8
 """Log odds of a rim: per evenness, share of slopes along the radii, and unevenness further inside; less this."""
-LEAST_CONTRAST = 0.7
-"""Mean correlation of its sectors with a ring's from which a rim is measured as a bright or a dark ring."""
+LEAST_CONTRAST = 0.65
+"""Mean correlation of its sectors with a ring's from which a rim is a bright or a dark ring, and is measured as one."""
 HOLE_M = 1.5e-3
 """A ring whose middle and radius are this near those of a round opening may be that opening."""
 BIN_M = 1e-3
@@ -123,34 +123,36 @@ class RimSearch:
 def find_faint_rims(search: RimSearch) -> FaintRims:
     """Look for a rim in each of some slots."""
     rings = most_even(search)
-    center, evenness = rings.center_m, rings.evenness
-    at = np.flatnonzero(rings.odds >= search.config.min_ring_odds)
-    circles, told = unknown_circles(len(center)), np.full(len(center), -np.inf)
+    at = np.flatnonzero(rings.evenness >= LEAST_EVENNESS)
+    circles, told = unknown_circles(len(rings.center_m)), np.full(len(rings.center_m), -np.inf)
     if len(at) == 0:
-        return FaintRims(center, circles, told)
-    free = (~search.blocked_at(center[at])).mean(axis=1)
-    seen = (free >= LEAST_FREE) & ~_at_another_height(center[at], search) & ~is_a_hole(center[at], search)
-    told[at] = np.where(seen, evenness[at], -np.inf)
-    return FaintRims(center, circles.put(at, _measured(center[at], free, search)), told)
+        return FaintRims(rings.center_m, circles, told)
+    free = (~search.blocked_at(rings.center_m[at])).mean(axis=1)
+    measured, is_ring = _measured(rings.center_m[at], free, search)
+    place = rings.center_m[at] + measured.offset_m
+    seen = (rings.odds[at] >= search.config.min_ring_odds) | is_ring
+    seen &= (free >= LEAST_FREE) & ~_at_another_height(place, search) & ~is_a_hole(place, search)
+    told[at] = np.where(seen, rings.evenness[at], -np.inf)
+    return FaintRims(rings.center_m, circles.put(at, measured), told)
 
 
-def _measured(center_m: FloatArray, free: FloatArray, search: RimSearch) -> Circles:
-    """Circles about even rings (N, 2), of which a share (N,) is free: as rings where they look like one, else as found.
+def _measured(center_m: FloatArray, free: FloatArray, search: RimSearch) -> tuple[Circles, NDArray[np.bool_]]:
+    """Circles about even rings (N, 2), of which a share (N,) is free, and which look like bright or dark rings, (N,).
 
-    As a bright ring where it is one, or a dark one.
+    Those are measured as any rim is, the others are where they are most even.
     """
     count, config = len(center_m), search.config
     even = np.tile(np.eye(2) * config.even_rim_m**2, (count, 1, 1))
-    circles, best = Circles(np.zeros((count, 2)), even, np.zeros(count), free), np.full(count, LEAST_CONTRAST)
+    circles, best = Circles(np.zeros((count, 2)), even, np.zeros(count), free), np.full(count, -np.inf)
     size = (np.full(count, search.level_m), np.tile(search.radii_m, (count, 1)))
     blocked = search.blocked_at(center_m)
     for view in (search.view, search.view.negative()):
         found = fit_rims(view, center_m, *size, blocked, config, config.faint_rim_bias_m)
         place = center_m + np.nan_to_num(found.offset_m)
         contrast = ring_contrast(view, place, *size, search.blocked_at(place))
-        better = np.isfinite(found.offset_m[:, 0]) & (contrast >= best)
+        better = np.isfinite(found.offset_m[:, 0]) & (contrast >= np.maximum(best, LEAST_CONTRAST))
         circles, best = found.where(better, circles), np.where(better, contrast, best)
-    return circles
+    return circles, np.isfinite(best)
 
 
 def _at_another_height(center_m: FloatArray, search: RimSearch) -> NDArray[np.bool_]:
