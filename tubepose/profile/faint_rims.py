@@ -123,7 +123,7 @@ class RimSearch:
 def find_faint_rims(search: RimSearch) -> FaintRims:
     """Look for a rim in each of some slots."""
     rings = most_even(search)
-    at = np.flatnonzero(rings.evenness >= LEAST_EVENNESS)
+    at = np.flatnonzero(np.isfinite(rings.odds))
     circles, told = unknown_circles(len(rings.center_m)), np.full(len(rings.center_m), -np.inf)
     if len(at) == 0:
         return FaintRims(rings.center_m, circles, told)
