@@ -48,6 +48,8 @@ MOST_EDGE = 0.6
 LIKELY = np.array([22.2, 44.4, 6.9])
 UNLIKELY = 54.8
 """Log odds of a rim: per evenness, share of slopes along the radii, and unevenness further inside; less this."""
+HOPELESS_ODDS = -3.0
+"""Rings with smaller log odds are not measured."""
 LEAST_CONTRAST = 0.65
 """Mean correlation of its sectors with a ring's from which a rim is a bright or a dark ring, and is measured as one."""
 HOLE_M = 1.5e-3
@@ -123,7 +125,7 @@ class RimSearch:
 def find_faint_rims(search: RimSearch) -> FaintRims:
     """Look for a rim in each of some slots."""
     rings = most_even(search)
-    at = np.flatnonzero(np.isfinite(rings.odds))
+    at = np.flatnonzero(rings.odds >= HOPELESS_ODDS)
     circles, told = unknown_circles(len(rings.center_m)), np.full(len(rings.center_m), -np.inf)
     if len(at) == 0:
         return FaintRims(rings.center_m, circles, told)
