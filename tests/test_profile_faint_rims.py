@@ -8,9 +8,10 @@ from tubepose.config import Config, ProfileConfig
 from tubepose.labware import load_tube
 from tubepose.profile import fit_profiles
 from tubepose.profile.faint_rims import RimSearch, find_faint_rims
-from tubepose.profile.measure import blocked_sectors
+from tubepose.profile.measure import blocked_sectors, measure_tops
 from tubepose.profile.outline import SECTORS
 from tubepose.profile.standing import Standing
+from tubepose.profile.tops import mouth_radius_m, top_radius_m
 from tubepose.transforms import invert_transform, transform_points
 
 CONFIG = ProfileConfig()
@@ -198,3 +199,29 @@ def test_a_tube_whose_rim_only_the_image_shows_gets_a_pose_and_no_other_slot_doe
             assert top[:2] == pytest.approx(place, abs=2e-4)
             assert len(entry.points_m) == 0
     assert invert_transform(VIEW)[2, 3] > level_m  # the camera stands above the rims
+
+
+def with_points_on_a_rim(gray_of_angle):
+    """What is measured of a tube in C5 whose rim has points all around, and in the image a gray for each direction."""
+    tube = load_tube("chen2023-tube-1")
+    level_m = RACK.floor_m + tube.height_m
+    place = RACK.slot("C5").center_m
+    off = level_points(VIEW, level_m) - place
+    rho, angle = np.hypot(*np.moveaxis(off, -1, 0)), np.arctan2(off[..., 1], off[..., 0])
+    on_rim = (rho > mouth_radius_m(tube)) & (rho < top_radius_m(tube))
+    gray = np.where(on_rim, gray_of_angle(angle), 60.0)
+    image = gray.reshape(CAMERA.height, 3, CAMERA.width, 3).mean(axis=(1, 3)).astype(np.uint8)
+    at = np.concatenate([off[1::3, 1::3] + place, np.full((CAMERA.height, CAMERA.width, 1), level_m)], axis=2)
+    cloud = np.where(on_rim[1::3, 1::3, None], transform_points(VIEW, at.reshape(-1, 3)).reshape(at.shape), np.nan)
+    found = measure_tops(frame_of(image, cloud), CAMERA, VIEW, RACK, [tube], Config())
+    assert [RACK.all_slots[slot].name for slot in found.tops.slot] == ["C5"]
+    return found.center_m[0] - place, np.sqrt(np.diag(found.circles.covariance_m2[0]))
+
+
+def test_a_torn_ring_that_is_no_ring_of_one_gray_is_less_sure():
+    off_m, std_m = with_points_on_a_rim(lambda angle: np.full(angle.shape, 160.0))
+    assert np.abs(off_m).max() < 1e-4
+    assert std_m.max() < 1.5e-4
+    off_m, std_m = with_points_on_a_rim(lambda angle: np.where(np.abs(angle) < 1.8, 160.0, 60.0))
+    assert np.abs(off_m).max() < CONFIG.lone_rim_m
+    assert std_m.min() > CONFIG.lone_rim_m
