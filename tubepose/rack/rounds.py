@@ -30,6 +30,7 @@ FULL_SQUARE = 12
 # The slots' distances are fitted with a blur that reaches from one rack's ribs to another's, until they settle.
 STRETCH_ROUNDS = 20
 SETTLED_STRETCH = 2e-4
+LOST_STRETCH = 0.1
 STRETCH_BLUR_M = 0.5e-3
 # No step shifts a pose by more.
 LONGEST_STEP_M = 1e-3
@@ -231,16 +232,25 @@ def round_step(points_m, rotation, origin_m, window_m, blur_m, widths_m, held, l
 
 @compiled
 def stretched(xy_m, low_m, cell_m, shape, table):
-    """Yaw, shifts and stretch (5,) with which places (N, 2) agree best, and what `edge_step` gives there."""
+    """Yaw, shifts and stretch (5,) with which places (N, 2) agree best, and what `edge_step` gives there.
+
+    Where that ends among other slots, too little is seen to tell: then it is what the first step says.
+    """
     moved, places = np.zeros(5), np.zeros((len(xy_m), 3))
-    for _ in range(STRETCH_ROUNDS):
+    for turn in range(STRETCH_ROUNDS):
         for k in range(len(xy_m)):
             x, y = xy_m[k, 0] - moved[1], xy_m[k, 1] - moved[2]
             places[k, 0] = (x + moved[0] * y) / (1.0 + moved[3])
             places[k, 1] = (y - moved[0] * x) / (1.0 + moved[4])
         local, distance, slope = laid(places, np.eye(3), np.zeros(3), np.inf, low_m, cell_m, shape, table)
         step, edges = edge_move(local, distance, slope, np.inf, STRETCH_BLUR_M, 5)
-        moved = moved + step
+        # Far from the middle a stretch moves edges as a shift does: no step is longer than edges are seen from.
+        farthest = 0.5 * cell_m * max(abs(step[3]) * shape[0], abs(step[4]) * shape[1])
+        moved = moved + step * min(1.0, LONGEST_STEP_M / max(farthest, 1e-12))
+        if turn == 0:
+            first, first_edges = moved, edges
+        if max(abs(moved[3]), abs(moved[4])) > LOST_STRETCH:
+            return first, first_edges
         if max(abs(step[3]), abs(step[4])) < SETTLED_STRETCH:
             break
     return moved, edges
