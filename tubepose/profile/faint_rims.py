@@ -125,29 +125,30 @@ class RimSearch:
 def find_faint_rims(search: RimSearch) -> FaintRims:
     """Look for a rim in each of some slots."""
     rings = most_even(search)
-    at = np.flatnonzero(rings.odds >= HOPELESS_ODDS)
+    odds = rings.odds
+    at = np.flatnonzero(odds >= HOPELESS_ODDS)
     circles, told = unknown_circles(len(rings.center_m)), np.full(len(rings.center_m), -np.inf)
     if len(at) == 0:
         return FaintRims(rings.center_m, circles, told)
-    free = (~search.blocked_at(rings.center_m[at])).mean(axis=1)
-    measured, is_ring = _measured(rings.center_m[at], free, search)
+    blocked = search.blocked_at(rings.center_m[at])
+    measured, is_ring = _measured(rings.center_m[at], blocked, search)
     place = rings.center_m[at] + measured.offset_m
-    seen = (rings.odds[at] >= search.config.min_ring_odds) | is_ring
-    seen &= (free >= LEAST_FREE) & ~_at_another_height(place, search) & ~is_a_hole(place, search)
+    seen = (odds[at] >= search.config.min_ring_odds) | is_ring
+    seen &= ((~blocked).mean(axis=1) >= LEAST_FREE) & ~_at_another_height(place, search) & ~is_a_hole(place, search)
     told[at] = np.where(seen, rings.evenness[at], -np.inf)
     return FaintRims(rings.center_m, circles.put(at, measured), told)
 
 
-def _measured(center_m: FloatArray, free: FloatArray, search: RimSearch) -> tuple[Circles, NDArray[np.bool_]]:
-    """Circles about even rings (N, 2), of which a share (N,) is free, and which look like bright or dark rings, (N,).
+def _measured(center_m: FloatArray, blocked: NDArray[np.bool_], search: RimSearch) -> tuple[Circles, NDArray[np.bool_]]:
+    """Circles about even rings (N, 2) with blocked sectors (N, SECTORS); which look like bright or dark rings, (N,).
 
     Those are measured as any rim is, the others are where they are most even.
     """
     count, config = len(center_m), search.config
     even = np.tile(np.eye(2) * config.even_rim_m**2, (count, 1, 1))
-    circles, best = Circles(np.zeros((count, 2)), even, np.zeros(count), free), np.full(count, -np.inf)
+    free, best = (~blocked).mean(axis=1), np.full(count, -np.inf)
+    circles = Circles(np.zeros((count, 2)), even, np.zeros(count), free)
     size = (np.full(count, search.level_m), np.tile(search.radii_m, (count, 1)))
-    blocked = search.blocked_at(center_m)
     for view in (search.view, search.view.negative()):
         found = fit_rims(view, center_m, *size, blocked, config, config.faint_rim_bias_m)
         place = center_m + np.nan_to_num(found.offset_m)

@@ -7,6 +7,7 @@ import math
 import numpy as np
 
 from tubepose.compiled import compiled
+from tubepose.profile.kernels import between
 
 LARGEST = 200.0
 """Exponents are cut here: the product of three such powers is still a number."""
@@ -132,16 +133,6 @@ def wall_sums(residual_m, normal, above_m, of, pose, weight, near_m):
             for j in range(5):
                 matrix[t, i, j] += w * row[i] * row[j]
     return matrix, vector
-
-
-@compiled
-def between(picture, x, y):
-    """A picture between its cells (bilinear), at a place well inside of it."""
-    i, j = int(x), int(y)
-    right, up = x - i, y - j
-    lower = picture[i, j] + up * (picture[i, j + 1] - picture[i, j])
-    upper = picture[i + 1, j] + up * (picture[i + 1, j + 1] - picture[i + 1, j])
-    return lower + right * (upper - lower)
 
 
 @compiled

@@ -187,6 +187,16 @@ def ends_on_planes(points_m, rows, of, offset_m, planes, least_m, near_m, center
 
 
 @compiled
+def between(picture, x, y):
+    """A picture between its cells (bilinear), at a place well inside of it."""
+    i, j = int(x), int(y)
+    right, up = x - i, y - j
+    lower = picture[i, j] * (1.0 - up) + picture[i, j + 1] * up
+    upper = picture[i + 1, j] * (1.0 - up) + picture[i + 1, j + 1] * up
+    return lower * (1.0 - right) + upper * right
+
+
+@compiled
 def radial_brightness(
     picture, camera, rotation, translation_m, centers_m, levels_m, radii_m, steps_m, sectors, per_sector
 ):
@@ -216,9 +226,5 @@ def radial_brightness(
                 nearness = 1.0 / (far + r * farther)
                 u = min(max(fx * (right + r * more_right) * nearness + cx, 0.0), width - 1.001)
                 v = min(max(fy * (ahead + r * more_ahead) * nearness + cy, 0.0), height - 1.001)
-                i, j = int(v), int(u)
-                dv, du = v - i, u - j
-                upper = picture[i, j] * (1.0 - du) + picture[i, j + 1] * du
-                lower = picture[i + 1, j] * (1.0 - du) + picture[i + 1, j + 1] * du
-                ray[b] += upper * (1.0 - dv) + lower * dv
+                ray[b] += between(picture, v, u)
     return sums / per_sector

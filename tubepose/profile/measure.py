@@ -19,7 +19,6 @@ from tubepose.profile.plane import TopPlanes, fit_top_planes
 from tubepose.profile.rims import RimView, fit_rims, rim_view
 from tubepose.profile.standing import Standing, gather_standing
 from tubepose.profile.tops import (
-    OVERLAP,
     Tops,
     find_tops,
     joined,
@@ -110,7 +109,7 @@ def measure_tops(
         found = _with_faint_rims(
             view, tops.take(~torn), rims.take(~torn), standing, rack, tubes, config.profile, allowed
         )
-        tops, rims = _with_others(*found, *rest, tubes)
+        tops, rims = _with_others(*found, *rest, rack, tubes)
     shape = _shapes(tops, tubes, rack)
     label = label_points(standing, tops.center_m, shape.radius_m)
     planes, discs = _measure_closed(standing, label, tops, shape, config.profile)
@@ -162,16 +161,22 @@ def _less_sure(rims: Circles, more_m: float) -> Circles:
 
 
 def _with_others(
-    tops: Tops, rims: Circles, other: Tops, other_rims: Circles, tubes: Sequence[TubeModel]
+    tops: Tops, rims: Circles, other: Tops, other_rims: Circles, rack: RackModel, tubes: Sequence[TubeModel]
 ) -> tuple[Tops, Circles]:
     """The same tops and circles, and those of others whose slots are left and that overlap none of them."""
-    left = ~np.isin(other.slot, tops.slot)
-    radius_m = np.array([top_radius_m(tube) for tube in tubes])
-    apart = np.linalg.norm(other.center_m[:, None] - tops.center_m[None], axis=2)
-    left &= np.all(apart > OVERLAP * (radius_m[other.tube][:, None] + radius_m[tops.tube]), axis=1)
+    free = np.setdiff1d(other.slot, tops.slot)
+    left = np.isin(other.slot, without_overlaps(free, tops.slot, *_by_slot(rack, other, tops), tubes))
     tops, rims = joined(tops, other.take(left)), joined(rims, other_rims.take(left))
     order = np.argsort(tops.slot, kind="stable")
     return tops.take(order), rims.take(order)
+
+
+def _by_slot(rack: RackModel, *found: Tops) -> tuple[NDArray[np.intp], FloatArray]:
+    """Type (S,) and support and place (S, 3) of the tops of all slots, the last one's; -1 and -inf for none."""
+    kind, place = np.full(len(rack.all_slots), -1), np.full((len(rack.all_slots), 3), -np.inf)
+    for tops in found:
+        kind[tops.slot], place[tops.slot] = tops.tube, np.column_stack([tops.support, tops.center_m])
+    return kind, place
 
 
 def _with_faint_rims(
@@ -194,18 +199,17 @@ def _with_faint_rims(
     for tube in (tubes[k] for k in types):
         radii = np.array([mouth_radius_m(tube), top_radius_m(tube)])
         reach_m = max(top_reach_m(rack.all_slots[i], tube, rack) for i in free)
+        level_m = top_level_m(tube, rack)
         search = RimSearch(
-            view, rack.slot_centers_m[free], reach_m, top_level_m(tube, rack), radii,
-            partial(_blocked_by, *known, float(radii[1])), standing, _holes_m(rack, standing, top_level_m(tube, rack)),
-            config,
+            view, rack.slot_centers_m[free], reach_m, level_m, radii, partial(_blocked_by, *known, float(radii[1])),
+            standing, _holes_m(rack, standing, level_m), config,
         )  # fmt: skip
         seen.append(find_faint_rims(search))
     evenness = np.stack([one.evenness for one in seen])
     if allowed is not None:
         evenness = np.where(allowed[np.ix_(types, free)], evenness, -np.inf)
     best, ranked = evenness.argmax(axis=0), np.sort(evenness, axis=0)
-    kind, place = np.full(len(rack.all_slots), -1), np.full((len(rack.all_slots), 3), -np.inf)
-    kind[tops.slot], place[tops.slot, 1:] = tops.tube, tops.center_m
+    kind, place = _by_slot(rack, tops)
     kind[free], place[free, 0] = types[best], ranked[-1]
     place[free, 1:] = np.stack([one.center_m for one in seen])[best, np.arange(len(free))]
     chosen = without_overlaps(free[np.isfinite(ranked[-1])], tops.slot, kind, place, tubes)

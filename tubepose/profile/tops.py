@@ -21,8 +21,6 @@ from tubepose.transforms import FloatArray
 CELL_M = 1.0e-3
 PASSES = 3
 PICTURE_POINTS = 40_000
-OVERLAP = 0.75
-"""Discs nearer than this share of the sum of their radii overlap."""
 CLOSE, NEAR = 0.03, 3.5
 """Scores that are as good as the best one, and how many cells from it they are the same place."""
 
@@ -244,7 +242,7 @@ def without_overlaps(
     """Slots in order, without those whose top overlaps a better one or one that was found before: discs cannot."""
     rows = np.concatenate([taken, slots[np.argsort(-place[slots, 0], kind="stable")]])
     radius, at = np.array([top_radius_m(tube) for tube in tubes])[kind[rows]], place[rows, 1:]
-    clear = np.hypot(*(at[:, None] - at).T) > OVERLAP * (radius[:, None] + radius)
+    clear = np.hypot(*(at[:, None] - at).T) > 0.75 * (radius[:, None] + radius)
     kept = np.arange(len(rows)) < len(taken)
     for row in range(len(taken), len(rows)):
         kept[row] = clear[row, kept].all()
