@@ -63,7 +63,7 @@ def views(folder: Path, trials: int | None) -> Iterator[View]:
         capture = next(iter((folder / "captures").glob(f"{name}-original*")))
         frame = next(iter(open_captures(capture)[0].frames()))
         truth = read_exact_truth(folder, name)
-        yield View(frame.points_m[frame.valid], truth.T_camera_rack, session.rack)
+        yield View(frame.measured_m, truth.T_camera_rack, session.rack)
 
 
 def error(pose: RackPose, view: View) -> FloatArray:

@@ -93,7 +93,7 @@ def rack_finder(choice: RackChoice, config: Config) -> RackFinder:
     from tubepose.rack.naming import name_rack
 
     def find(frame: RgbdFrame) -> RackPose:
-        points_m = frame.points_m[frame.valid]
+        points_m = frame.measured_m
         if choice.lattice is not None:
             return register_grid(points_m, choice.lattice, config, frame.intrinsics)
         pose, _ = name_rack(points_m, config, intrinsics=frame.intrinsics)

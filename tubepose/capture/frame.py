@@ -85,3 +85,17 @@ class RgbdFrame:
     def valid(self) -> NDArray[np.bool_]:
         """Which rows of `points_m` are measured, shape (H * W,)."""
         return np.isfinite(self.points_m[:, 2])
+
+    @property
+    def measured_m(self) -> FloatArray:
+        """The valid points, shape (N, 3)."""
+        return finite_points(self.cloud_m)
+
+
+def finite_points(cloud_m: FloatArray) -> FloatArray:
+    """The measured points of a part of an organised cloud (H, W, 3), row by row, shape (N, 3), metres."""
+    if cloud_m.strides[2] != cloud_m.itemsize:
+        cloud_m = np.ascontiguousarray(cloud_m)
+    # A point is copied as one thing, which is sooner done than number by number.
+    whole = cloud_m.view(np.dtype((np.void, 3 * cloud_m.itemsize)))[..., 0]
+    return np.asarray(whole[np.isfinite(cloud_m[..., 2])].view(cloud_m.dtype).reshape(-1, 3))

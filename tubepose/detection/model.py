@@ -8,7 +8,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from tubepose.capture.frame import RgbdFrame
+from tubepose.capture.frame import RgbdFrame, finite_points
 from tubepose.labware.tubes import RACK_CLASS
 from tubepose.transforms import FloatArray
 
@@ -87,8 +87,7 @@ def points_in_box(frame: RgbdFrame, detection: Detection, margin: float = 0.0) -
     if detection.point_rows is not None:
         return frame.points_m[_valid_rows(frame, detection.point_rows)]
     (v0, v1), (u0, u1) = _pixels(frame, detection, margin)
-    points_m = frame.cloud_m[v0:v1, u0:u1].reshape(-1, 3)
-    return np.compress(np.isfinite(points_m[:, 2]), points_m, axis=0)
+    return finite_points(frame.cloud_m[v0:v1, u0:u1])
 
 
 def _pixels(frame: RgbdFrame, detection: Detection, margin: float) -> tuple[tuple[int, int], tuple[int, int]]:

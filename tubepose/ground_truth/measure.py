@@ -93,7 +93,7 @@ def measure_ground_truth(
         KeyError: A declared slot is not in the rack.
     """
     scene = _Scene(rack, tubes, cap, config)
-    T_camera_any = find_rack(frame.points_m[frame.valid], rack, config)
+    T_camera_any = find_rack(frame.measured_m, rack, config)
     if T_camera_any is None:
         width, depth = rack.outline_mm
         return _refused(scene, f"no rack top of {width:g} x {depth:g} mm ({rack.name}) found")

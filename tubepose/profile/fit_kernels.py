@@ -145,6 +145,7 @@ def even_rings(picture, places, shifts, around, ring, outside, inside, least_see
     count; with fewer than `least_seen` of them there is no ring, nor where one leaves the picture.
     """
     evenness, best = np.full(len(places), -np.inf), np.zeros(len(places), np.intp)
+    cells, columns = picture.reshape(-1), picture.shape[1]
     for s in range(len(places)):
         for m in range(len(shifts)):
             x, y = places[s, 0] + shifts[m, 0], places[s, 1] + shifts[m, 1]
@@ -153,11 +154,11 @@ def even_rings(picture, places, shifts, around, ring, outside, inside, least_see
             seen, own, own2, outer, outer2, inner, inner2 = 0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
             for d in range(len(around)):
                 right, up = around[d, 0], around[d, 1]
-                beyond = between(picture, x + outside * right, y + outside * up)
-                within = between(picture, x + inside * right, y + inside * up)
+                beyond = between(cells, columns, x + outside * right, y + outside * up)
+                within = between(cells, columns, x + inside * right, y + inside * up)
                 along, along2 = 0.0, 0.0
                 for radius in ring:
-                    value = between(picture, x + radius * right, y + radius * up)
+                    value = between(cells, columns, x + radius * right, y + radius * up)
                     along += value
                     along2 += value * value
                 if math.isfinite(beyond + within + along):
@@ -187,14 +188,15 @@ def ring_sides(picture, places, around, ring, beside, differs, noise):
     outside; else 0.
     """
     found = np.zeros((len(places), 5))
+    cells, columns = picture.reshape(-1), picture.shape[1]
     along, sides = np.empty((len(around), len(ring))), np.empty((len(around), 3))
     for s in range(len(places)):
         for d in range(len(around)):
             right, up = around[d, 0], around[d, 1]
             for r in range(len(ring)):
-                along[d, r] = between(picture, places[s, 0] + ring[r] * right, places[s, 1] + ring[r] * up)
+                along[d, r] = between(cells, columns, places[s, 0] + ring[r] * right, places[s, 1] + ring[r] * up)
             for r in range(3):
-                sides[d, r] = between(picture, places[s, 0] + beside[r] * right, places[s, 1] + beside[r] * up)
+                sides[d, r] = between(cells, columns, places[s, 0] + beside[r] * right, places[s, 1] + beside[r] * up)
         gray = np.nanmedian(along)
         scatter = math.sqrt(np.nanmean((along - gray) ** 2))
         for d in range(len(around)):
@@ -215,12 +217,13 @@ def edge_shares(slope_x, slope_y, places, around, edges, least):
     Of every direction (D, 2) the largest share ``(n . g)^2 / (|g|^2 + least^2)`` at the radii `edges` (R,) counts.
     """
     shares = np.zeros(len(places))
+    cells_x, cells_y, columns = slope_x.reshape(-1), slope_y.reshape(-1), slope_x.shape[1]
     for s in range(len(places)):
         for d in range(len(around)):
             most = 0.0
             for radius in edges:
                 x, y = places[s, 0] + radius * around[d, 0], places[s, 1] + radius * around[d, 1]
-                across, along = between(slope_x, x, y), between(slope_y, x, y)
+                across, along = between(cells_x, columns, x, y), between(cells_y, columns, x, y)
                 radial = across * around[d, 0] + along * around[d, 1]
                 share = radial * radial / (across * across + along * along + least * least)
                 if share > most:  # False for NaN

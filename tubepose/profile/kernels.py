@@ -187,12 +187,13 @@ def ends_on_planes(points_m, rows, of, offset_m, planes, least_m, near_m, center
 
 
 @compiled
-def between(picture, x, y):
-    """A picture between its cells (bilinear), at a place well inside of it."""
+def between(cells, columns, x, y):
+    """A picture between its cells (bilinear), which are given row by row (N,), at a place well inside of it."""
     i, j = int(x), int(y)
     right, up = x - i, y - j
-    lower = picture[i, j] * (1.0 - up) + picture[i, j + 1] * up
-    upper = picture[i + 1, j] * (1.0 - up) + picture[i + 1, j + 1] * up
+    at = i * columns + j
+    lower = cells[at] * (1.0 - up) + cells[at + 1] * up
+    upper = cells[at + columns] * (1.0 - up) + cells[at + columns + 1] * up
     return lower * (1.0 - right) + upper * right
 
 
@@ -206,14 +207,16 @@ def radial_brightness(
     outside of it those of its border count.
     """
     height, width = picture.shape
+    cells = picture.reshape(-1)
     fx, fy, cx, cy = camera[0], camera[1], camera[2], camera[3]
     sums = np.zeros((len(centers_m), sectors, len(steps_m)))
     middle, outwards = np.empty(3), np.empty(3)
+    u, v = np.empty(len(steps_m)), np.empty(len(steps_m))
     for t in range(len(centers_m)):
         for i in range(3):
             row = rotation[i]
             middle[i] = row[0] * centers_m[t, 0] + row[1] * centers_m[t, 1] + row[2] * levels_m[t] + translation_m[i]
-        right, ahead, far = middle[0], middle[1], middle[2]
+        right, ahead, far, radius_m = middle[0], middle[1], middle[2], radii_m[t]
         for a in range(sectors * per_sector):
             angle = (a + 0.5) / (sectors * per_sector) * 2.0 * math.pi - math.pi
             cos, sin = math.cos(angle), math.sin(angle)
@@ -221,10 +224,13 @@ def radial_brightness(
                 outwards[i] = rotation[i, 0] * cos + rotation[i, 1] * sin
             more_right, more_ahead, farther = outwards[0], outwards[1], outwards[2]
             ray = sums[t, a // per_sector]
+            # Several places are computed at once where nothing is read between them.
             for b in range(len(steps_m)):
-                r = radii_m[t] + steps_m[b]
+                r = radius_m + steps_m[b]
                 nearness = 1.0 / (far + r * farther)
-                u = min(max(fx * (right + r * more_right) * nearness + cx, 0.0), width - 1.001)
-                v = min(max(fy * (ahead + r * more_ahead) * nearness + cy, 0.0), height - 1.001)
-                ray[b] += between(picture, v, u)
+                u[b] = fx * (right + r * more_right) * nearness + cx
+                v[b] = fy * (ahead + r * more_ahead) * nearness + cy
+            for b in range(len(steps_m)):
+                x, y = min(max(u[b], 0.0), width - 1.001), min(max(v[b], 0.0), height - 1.001)
+                ray[b] += between(cells, width, y, x)
     return sums / per_sector

@@ -113,7 +113,8 @@ def brightness(frame: RgbdFrame) -> NDArray[np.float32] | NDArray[np.uint8]:
     """Gray values of a frame, shape (H, W); 1 and 0 for pixels with and without depth where it has no image."""
     if frame.image is None:
         return np.isfinite(frame.cloud_m[..., 2]).astype(np.float32)
-    return frame.image if frame.image.ndim == 2 else frame.image.mean(axis=2, dtype=np.float32)
+    gray = frame.image if frame.image.ndim == 2 else frame.image.mean(axis=2, dtype=np.float32)
+    return np.ascontiguousarray(gray)
 
 
 def _radial_profiles(

@@ -225,6 +225,7 @@ def _windows(rack: RackModel, tube: TubeModel, reach_m: float) -> tuple[NDArray[
     return low.astype(np.intp), high.astype(np.intp)
 
 
+@lru_cache(maxsize=1024)
 def top_reach_m(slot: SlotModel, tube: TubeModel, rack: RackModel) -> float:
     """How far the middle of a tube's top can be from its slot's axis, metres: the floor's play, and the lean beyond."""
     play = rack.floor_play_mm * 1e-3

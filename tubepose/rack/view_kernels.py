@@ -7,23 +7,25 @@ import math
 import numpy as np
 
 from tubepose.compiled import compiled
-from tubepose.rack.kernels import in_frame
+from tubepose.rack.kernels import in_frame, numbers
 
 
 @compiled
 def labelled(points_m, rotation, origin_m, camera_m, reach_m, window_m, through_m):
     """Points within `window_m` of a frame's plane (N, 3), and where sight to those far below crosses it (M, 2)."""
+    frame, reach_x, reach_y = numbers(rotation, origin_m), reach_m[0], reach_m[1]
+    camera_x, camera_y, camera_z = camera_m[0], camera_m[1], camera_m[2]
     solid, free = np.empty_like(points_m), np.empty((len(points_m), 2))
     solids, frees = 0, 0
     for k in range(len(points_m)):
-        right, ahead, up = in_frame(points_m[k], rotation, origin_m)
+        right, ahead, up = in_frame(frame, points_m[k, 0], points_m[k, 1], points_m[k, 2])
         if not (abs(up) < window_m or up < -through_m):
             continue
         if up < -through_m:
-            share = up / (up - camera_m[2])
-            right += share * (camera_m[0] - right)
-            ahead += share * (camera_m[1] - ahead)
-        if abs(right) < reach_m[0] and abs(ahead) < reach_m[1]:
+            share = up / (up - camera_z)
+            right += share * (camera_x - right)
+            ahead += share * (camera_y - ahead)
+        if abs(right) < reach_x and abs(ahead) < reach_y:
             if up < -through_m:
                 free[frees, 0], free[frees, 1] = right, ahead
                 frees += 1
@@ -36,12 +38,14 @@ def labelled(points_m, rotation, origin_m, camera_m, reach_m, window_m, through_
 @compiled
 def cells_crossed(points_m, step, rotation, origin_m, camera_m, side_m, shape):
     """Which cells of a rectangle about a frame's origin the lines of sight to every `step`-th point cross."""
+    frame, side_x, side_y = numbers(rotation, origin_m), side_m[0], side_m[1]
+    camera_x, camera_y, camera_z = camera_m[0], camera_m[1], camera_m[2]
     hit = np.zeros((shape[0], shape[1]), np.bool_)
     for k in range(0, len(points_m), step):
-        right, ahead, up = in_frame(points_m[k], rotation, origin_m)
-        share = up / (up - camera_m[2])
-        u = (right + share * (camera_m[0] - right)) / side_m[0] + 0.5
-        v = (ahead + share * (camera_m[1] - ahead)) / side_m[1] + 0.5
+        right, ahead, up = in_frame(frame, points_m[k, 0], points_m[k, 1], points_m[k, 2])
+        share = up / (up - camera_z)
+        u = (right + share * (camera_x - right)) / side_x + 0.5
+        v = (ahead + share * (camera_y - ahead)) / side_y + 0.5
         if 0 <= u < 1 and 0 <= v < 1:
             hit[int(u * shape[0]), int(v * shape[1])] = True
     return hit
@@ -50,16 +54,16 @@ def cells_crossed(points_m, step, rotation, origin_m, camera_m, side_m, shape):
 @compiled
 def seen_through(points_m, rotation, origin_m, camera_m, reach_m):
     """Points (N, 3), unchanged, whose lines of sight cross a frame's plane within `reach_m` (2,) of its origin."""
+    frame, reach_x, reach_y = numbers(rotation, origin_m), reach_m[0], reach_m[1]
+    camera_x, camera_y, camera_z = camera_m[0], camera_m[1], camera_m[2]
     kept = np.empty_like(points_m)
     count = 0
     for k in range(len(points_m)):
-        right, ahead, up = in_frame(points_m[k], rotation, origin_m)
-        along = camera_m[2] / (camera_m[2] - up)
-        if (
-            abs(camera_m[0] + along * (right - camera_m[0])) < reach_m[0]
-            and abs(camera_m[1] + along * (ahead - camera_m[1])) < reach_m[1]
-        ):
-            kept[count] = points_m[k]
+        right, ahead, up = in_frame(frame, points_m[k, 0], points_m[k, 1], points_m[k, 2])
+        along = camera_z / (camera_z - up)
+        u, v = camera_x + along * (right - camera_x), camera_y + along * (ahead - camera_y)
+        if abs(u) < reach_x and abs(v) < reach_y:
+            kept[count, 0], kept[count, 1], kept[count, 2] = points_m[k, 0], points_m[k, 1], points_m[k, 2]
             count += 1
     return kept[:count]
 
@@ -90,9 +94,10 @@ def close_counts(values, offsets, distance):
     """How many values of every row (N, M) are within a distance of the row's offset (N,)."""
     counts = np.empty(len(values), np.intp)
     for k in range(len(values)):
-        count = 0
-        for value in values[k]:
-            count += abs(value - offsets[k]) < distance
+        # As wide as the values: several are compared at once.
+        count, row, offset = np.int32(0), values[k], offsets[k]
+        for i in range(len(row)):
+            count += np.int32(abs(row[i] - offset) < distance)
         counts[k] = count
     return counts
 
@@ -140,10 +145,10 @@ def clipped(hits, misses, weight, full):
 @compiled
 def band_places(points_m, rotation, origin_m, height_m):
     """Places (N, 2) in a frame of the points (M, 3) within a height of its plane."""
-    flat = np.empty((len(points_m), 2))
+    frame, flat = numbers(rotation, origin_m), np.empty((len(points_m), 2))
     count = 0
     for k in range(len(points_m)):
-        right, ahead, up = in_frame(points_m[k], rotation, origin_m)
+        right, ahead, up = in_frame(frame, points_m[k, 0], points_m[k, 1], points_m[k, 2])
         if abs(up) < height_m:
             flat[count, 0], flat[count, 1] = right, ahead
             count += 1
@@ -153,9 +158,10 @@ def band_places(points_m, rotation, origin_m, height_m):
 @compiled
 def crossed(points_m, step, rotation, origin_m, camera_m):
     """Where the lines of sight to every `step`-th point (N, 3) cross a frame's plane, shape (M, 2)."""
-    at = np.empty(((len(points_m) + step - 1) // step, 2))
+    frame, at = numbers(rotation, origin_m), np.empty(((len(points_m) + step - 1) // step, 2))
+    camera_x, camera_y, camera_z = camera_m[0], camera_m[1], camera_m[2]
     for k in range(len(at)):
-        right, ahead, up = in_frame(points_m[k * step], rotation, origin_m)
-        share = up / (up - camera_m[2])
-        at[k, 0], at[k, 1] = right + share * (camera_m[0] - right), ahead + share * (camera_m[1] - ahead)
+        right, ahead, up = in_frame(frame, points_m[k * step, 0], points_m[k * step, 1], points_m[k * step, 2])
+        share = up / (up - camera_z)
+        at[k, 0], at[k, 1] = right + share * (camera_x - right), ahead + share * (camera_y - ahead)
     return at

@@ -80,7 +80,7 @@ class _TopView:
 
     def __init__(self, scene: Scene) -> None:
         T = scene.rack_pose.T_camera_rack
-        points = scene.frame.points_m[scene.frame.valid]
+        points = scene.frame.measured_m
         self.R = np.diag([1.0, -1.0, -1.0]) if T is None else T[:3, :3].T
         flat = points @ self.R.T * [1, -1, 1]
         low, high = np.percentile(flat[:, :2], [0.5, 99.5], axis=0) if len(flat) else (np.zeros(2), np.ones(2))
