@@ -46,7 +46,7 @@ def run_estimates(
     from tubepose.provenance import pinned_threads, run_record
     from tubepose.records import ESTIMATE_COLUMNS, RACK_COLUMNS, SLOT_COLUMNS, TIMING_COLUMNS, to_table
     from tubepose.report.writing import make_folder, write_csv, write_json
-    from tubepose_cli.show import progress
+    from tubepose_cli.show import progress, say_when_compiling
 
     taken: dict[str, tuple[str, ...]] = {}
 
@@ -55,6 +55,7 @@ def run_estimates(
             write_overlay(out / "overlays" / overlay_name(job, scene, taken), scene, estimates)
 
     make_folder(out)
+    say_when_compiling()
     tables, stopped = Tables(), ""
     try:
         with pinned_threads(1), progress("captures", len(jobs)) as step:

@@ -76,6 +76,13 @@ def say(text: str) -> None:
     typer.echo(one_line(text), err=True)
 
 
+def say_when_compiling() -> None:
+    """One line before loops are compiled: it takes a while, and happens once on a machine."""
+    from tubepose.compiled import before_compiling
+
+    before_compiling(lambda: say("compiling for this machine, once: about a minute"))
+
+
 def show_table(table: pd.DataFrame, title: str, notes: Sequence[str] = ()) -> None:
     """A table of strings on stdout, with notes under it."""
     from rich.console import Console

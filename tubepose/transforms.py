@@ -27,6 +27,11 @@ def translation(offset_m: ArrayLike) -> FloatArray:
     return make_transform(np.eye(3), np.asarray(offset_m, dtype=np.float64))
 
 
+def parts(T: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Rotation (3, 3) and translation (3,), metres, of a transform: arrays of their own, as compiled loops want."""
+    return np.ascontiguousarray(T[:3, :3]), np.ascontiguousarray(T[:3, 3])
+
+
 def invert_transform(T: FloatArray) -> FloatArray:
     """Invert a rigid (4, 4) transform."""
     R = T[:3, :3]

@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from tubepose.compiled import compiled
+from tubepose.compiled import compiled, mean_square, median
 from tubepose.profile.kernels import between
 
 LARGEST = 200.0
@@ -189,24 +189,35 @@ def ring_sides(picture, places, around, ring, beside, differs, noise):
     """
     found = np.zeros((len(places), 5))
     cells, columns = picture.reshape(-1), picture.shape[1]
-    along, sides = np.empty((len(around), len(ring))), np.empty((len(around), 3))
+    along, known = np.empty(len(around) * len(ring)), np.empty(len(around) * len(ring))
+    sides, mean, variance = np.empty((3, len(around))), np.empty(3), np.empty(3)
     for s in range(len(places)):
+        count = 0
         for d in range(len(around)):
             right, up = around[d, 0], around[d, 1]
             for r in range(len(ring)):
-                along[d, r] = between(cells, columns, places[s, 0] + ring[r] * right, places[s, 1] + ring[r] * up)
+                value = between(cells, columns, places[s, 0] + ring[r] * right, places[s, 1] + ring[r] * up)
+                along[d * len(ring) + r] = value
+                if not math.isnan(value):
+                    known[count] = value
+                    count += 1
             for r in range(3):
-                sides[d, r] = between(cells, columns, places[s, 0] + beside[r] * right, places[s, 1] + beside[r] * up)
-        gray = np.nanmedian(along)
-        scatter = math.sqrt(np.nanmean((along - gray) ** 2))
+                sides[r, d] = between(cells, columns, places[s, 0] + beside[r] * right, places[s, 1] + beside[r] * up)
+        if count == 0:
+            continue
+        gray = median(known[:count])
+        scatter = math.sqrt(mean_square(along, gray)[0])
+        for r in range(3):
+            mean[r] = mean_square(sides[r], 0.0)[1]
+            variance[r] = mean_square(sides[r], mean[r])[0]
         for d in range(len(around)):
-            outer, inner = abs(sides[d, 0] - gray), abs(sides[d, 1] - gray)
+            outer, inner = abs(sides[0, d] - gray), abs(sides[1, d] - gray)
             found[s, 0] += (outer > differs) / len(around)
             found[s, 1] += (inner > differs) / len(around)
             found[s, 2] += (max(outer, inner) > scatter) / len(around)
-        found[s, 3] = math.log((np.nanvar(sides[:, 2]) + noise) / (np.nanvar(sides[:, 1]) + noise))
-        if (np.nanmean(sides[:, 0]) - gray) * (gray - np.nanmean(sides[:, 1])) > 0.0:
-            found[s, 4] = (scatter * scatter + noise) / (np.nanvar(sides[:, 0]) + noise)
+        found[s, 3] = math.log((variance[2] + noise) / (variance[1] + noise))
+        if (mean[0] - gray) * (gray - mean[1]) > 0.0:
+            found[s, 4] = (scatter * scatter + noise) / (variance[0] + noise)
     return found
 
 

@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from tubepose.compiled import compiled, solved
+from tubepose.compiled import compiled, put_in_order, solved
 
 ROUNDS = 4
 LEAST_SIGMA_M = 3.0e-5
@@ -49,7 +49,7 @@ def plane_sums(label, offset_m, height_m, expected_m, band_m, radius_m, planes, 
 @compiled
 def median_heights(label, offset_m, height_m, expected_m, band_m, radius_m, step):
     """Median height (T,) of every `step`-th point that `plane_sums` would count; what is expected without any."""
-    kept, counts = np.empty((len(label) + step - 1) // step, np.intp), np.zeros(len(expected_m), np.intp)
+    kept, ends = np.empty((len(label) + step - 1) // step, np.intp), np.zeros(len(expected_m) + 1, np.intp)
     count = 0
     for k in range(0, len(label), step):
         t = label[k]
@@ -57,17 +57,20 @@ def median_heights(label, offset_m, height_m, expected_m, band_m, radius_m, step
         if x * x + y * y < radius_m[t] * radius_m[t] and abs(height_m[k] - expected_m[t]) < band_m:
             kept[count] = k
             count += 1
-            counts[t] += 1
-    ends = np.cumsum(counts)
-    free, ordered = ends - counts, np.empty(count)
-    for k in kept[:count]:
-        ordered[free[label[k]]] = height_m[k]
-        free[label[k]] += 1
-    median = expected_m.copy()
-    for t in range(len(counts)):
-        if counts[t]:
-            median[t] = np.sort(ordered[ends[t] - counts[t] : ends[t]])[counts[t] // 2]
-    return median
+            ends[t + 1] += 1
+    for t in range(len(expected_m)):
+        ends[t + 1] += ends[t]
+    free, ordered = ends.copy(), np.empty(count)
+    for i in range(count):
+        t = label[kept[i]]
+        ordered[free[t]] = height_m[kept[i]]
+        free[t] += 1
+    heights = expected_m.copy()
+    for t in range(len(expected_m)):
+        if ends[t + 1] > ends[t]:
+            put_in_order(ordered[ends[t] : ends[t + 1]])
+            heights[t] = ordered[ends[t] + (ends[t + 1] - ends[t]) // 2]
+    return heights
 
 
 @compiled
@@ -77,20 +80,25 @@ def plane_rounds(label, offset_m, height_m, expected_m, band_m, radius_m, step, 
     The rounds see every `step`-th point, the median every fourth of those, and one more round all of them. Planes with
     a weight of less than the least stay as they were.
     """
-    planes, sigma_m = np.zeros((len(expected_m), 3)), np.full(len(expected_m), band_m / 3.0)
-    planes[:, 0] = median_heights(label, offset_m, height_m, expected_m, band_m, radius_m, 4 * step)
+    planes, sigma_m, points = np.zeros((len(expected_m), 3)), np.empty(len(expected_m)), np.empty(len(expected_m))
+    heights = median_heights(label, offset_m, height_m, expected_m, band_m, radius_m, 4 * step)
+    for t in range(len(planes)):
+        planes[t, 0], sigma_m[t] = heights[t], band_m / 3.0
     normal = np.empty((3, 3))
     for again in range(ROUNDS, -1, -1):
         sums = plane_sums(
             label, offset_m, height_m, expected_m, band_m, radius_m, planes, sigma_m, step if again else 1
         )
         for t in range(len(planes)):
-            w, x, y, xx, xy, yy = sums[t, :6]
+            w, x, y = sums[t, 0], sums[t, 1], sums[t, 2]
+            xx, xy, yy = sums[t, 3], sums[t, 4], sums[t, 5]
             determinant = w * (xx * yy - xy * xy) - x * (x * yy - xy * y) + y * (x * xy - xx * y)
             if w >= least and determinant > 0.0:
                 normal[0, 0], normal[0, 1], normal[0, 2] = w, x, y
                 normal[1, 0], normal[1, 1], normal[1, 2] = x, xx, xy
                 normal[2, 0], normal[2, 1], normal[2, 2] = y, xy, yy
-                planes[t] = solved(normal, sums[t, 6:9])
+                plane = solved(normal, sums[t, 6:9])
+                planes[t, 0], planes[t, 1], planes[t, 2] = plane[0], plane[1], plane[2]
+            points[t] = sums[t, 10]
             sigma_m[t] = max(math.sqrt(sums[t, 9] / max(w, 1e-9)), LEAST_SIGMA_M)
-    return planes, sigma_m, sums[:, 10]
+    return planes, sigma_m, points

@@ -12,7 +12,7 @@ from tubepose.config import ProfileConfig
 from tubepose.profile.fit_kernels import shift_scores
 from tubepose.profile.kernels import radial_brightness
 from tubepose.profile.outline import NORMALS, SECTORS, Circles, fit_circles
-from tubepose.transforms import FloatArray
+from tubepose.transforms import FloatArray, parts
 
 BIN_M = 0.25e-3
 WIDE_M = 1.75e-3
@@ -130,8 +130,7 @@ def _radial_profiles(
     steps = np.arange(-reach, reach + BIN_M / 2, BIN_M)
     lens, T = view.intrinsics, view.T_camera_rack
     camera = np.array([lens.fx, lens.fy, lens.cx, lens.cy])
-    R, t = np.ascontiguousarray(T[:3, :3]), np.ascontiguousarray(T[:3, 3])
-    values = radial_brightness(view.picture, camera, R, t, center_m, level_m, middle, steps, SECTORS, PER_SECTOR)
+    values = radial_brightness(view.picture, camera, *parts(T), center_m, level_m, middle, steps, SECTORS, PER_SECTOR)
     return np.asarray(values), steps
 
 

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from tubepose.capture.frame import CameraIntrinsics, RgbdFrame
 from tubepose.labware import RackModel
 from tubepose.profile.kernels import points_over
-from tubepose.transforms import FloatArray, invert_transform, transform_points
+from tubepose.transforms import FloatArray, invert_transform, parts, transform_points
 
 OUTSIDE_M = 0.012
 """A cap of a leaning tube in an outer slot reaches this far over the rack's outline."""
@@ -77,7 +77,5 @@ def gather_standing(
             low, high = np.floor(uv.min(axis=0)).astype(int), np.ceil(uv.max(axis=0)).astype(int) + 1
             left, right = np.clip([low[0], high[0]], 0, width)
             top, bottom = np.clip([low[1], high[1]], 0, height)
-    points = points_over(
-        frame.cloud_m[top:bottom, left:right], T_rack_camera[:3, :3], T_rack_camera[:3, 3], lowest_m, highest_m, half
-    )
+    points = points_over(frame.cloud_m[top:bottom, left:right], *parts(T_rack_camera), lowest_m, highest_m, half)
     return Standing(points, T_rack_camera[:3, 3])

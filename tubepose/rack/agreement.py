@@ -20,7 +20,7 @@ from tubepose.rack import view_kernels as view_kernels
 from tubepose.rack.evidence import evidence_of
 from tubepose.rack.field import GRID_M, PICTURE_M, picture, top_field
 from tubepose.rack.fit import LEAST_POINTS, Fit, RoughFit, camera_place, label, rack_frame, top_frame
-from tubepose.transforms import FloatArray
+from tubepose.transforms import FloatArray, parts
 
 # Half thickness of the layer that is judged: the standard deviation of heights, but at least that of a good sensor, and
 # no more than the layer that a tube's wall fills with few points.
@@ -93,7 +93,7 @@ def measure_agreement(points_m: FloatArray, fit: Fit, rack: RackModel, config: R
     window_m = float(np.clip(fit.scatter_m, *JUDGED_M))
     seen = label(points_m, fit.T_camera_rack, rack, window_m)
     top = top_field(rack)
-    distance, _, known = top.look_up(seen.solid_m[:, :2])
+    distance, _, known = top.look_up(seen.solid_m)
     solid, distance = seen.solid_m[known], distance[known]
     if len(solid) < LEAST_POINTS or not np.any(distance < 0):
         return Agreement()
@@ -141,7 +141,7 @@ def _unseen(points_m: FloatArray, fit: Fit, rack: RackModel) -> float:
     shape = np.ceil(rack.outline_m / (4 * PICTURE_M)).astype(int)
     T = top_frame(fit.T_camera_rack, rack)
     step = len(points_m) // 10_000 + 1
-    hit = view_kernels.cells_crossed(points_m, step, T[:3, :3], T[:3, 3], camera_place(T), rack.outline_m, shape)
+    hit = view_kernels.cells_crossed(points_m, step, *parts(T), camera_place(T), rack.outline_m, shape)
     return float(1 - hit.mean())
 
 

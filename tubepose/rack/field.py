@@ -14,7 +14,7 @@ from scipy import fft
 
 from tubepose.labware import RackModel
 from tubepose.rack import kernels as kernels
-from tubepose.transforms import FloatArray
+from tubepose.transforms import FloatArray, parts
 
 Float32 = NDArray[np.float32]
 # Distances are looked up to first order: a cell of 0.25 mm errs by less than 0.01 mm on a corner of 2 mm radius.
@@ -58,8 +58,7 @@ class TopField:
         self, points_m: FloatArray, T_camera_top: FloatArray, height_m: float, inside_m: float = 0.0
     ) -> FloatArray:
         """Points (N, 3), camera frame, in a top's frame: within a height of it, and so far inside its solid part."""
-        R, origin_m = T_camera_top[:3, :3], T_camera_top[:3, 3]
-        local, distance, _ = kernels.laid(points_m, R, origin_m, height_m, *self.grid)
+        local, distance, _ = kernels.laid(points_m, *parts(T_camera_top), height_m, *self.grid)
         return np.asarray(local[distance < -inside_m])
 
     @property

@@ -18,7 +18,7 @@ from tubepose.rack import view_kernels as view_kernels
 from tubepose.rack.field import TopField, top_field
 from tubepose.rack.rounds import INSIDE_M, WIDEST_M
 from tubepose.rack.tops import Level
-from tubepose.transforms import FloatArray, make_transform, translation
+from tubepose.transforms import FloatArray, make_transform, parts, translation
 
 # Per round: blur of the edges (the first as wide as a coarse start may be off, the last half a pixel of 0.4 mm), and
 # half widths of the heights that a plane is fitted to, one after the other.
@@ -129,8 +129,8 @@ def filled(rough: RoughFit, points_m: FloatArray, rack: RackModel) -> RoughFit:
 
 def _near_top(points_m: FloatArray, T_camera_top: FloatArray, rack: RackModel) -> FloatArray:
     """Points (N, 3), camera frame, a little beside a top and above and below it at most."""
-    R, origin_m, reach_m = T_camera_top[:3, :3], T_camera_top[:3, 3], rack.outline_m / 2 + 5e-3
-    return np.asarray(kernels.in_box(np.ascontiguousarray(points_m, float), R, origin_m, reach_m, -5e-3, 5e-3))
+    points_m, reach_m = np.ascontiguousarray(points_m, float), rack.outline_m / 2 + 5e-3
+    return np.asarray(kernels.in_box(points_m, *parts(T_camera_top), reach_m, -5e-3, 5e-3))
 
 
 def refine(state: RoughFit, rack: RackModel) -> Fit:
@@ -194,7 +194,7 @@ def _step(
     window_m = max(EDGE_WINDOW_M, min(3 * state.scatter_m, float(widths_m[0])))
     held = state.level is not None
     (plane, scatter_m, normal, scores), inside, (edges, outlines), stray = rounds.round_step(
-        points_m, T[:3, :3], T[:3, 3], window_m, blur_m, widths_m, held, *field.grid
+        points_m, *parts(T), window_m, blur_m, widths_m, held, *field.grid
     )
     state.covariance = UNKNOWN * np.eye(6)
     if len(inside) < LEAST_POINTS:
@@ -245,7 +245,7 @@ def label(points_m: FloatArray, T_camera_rack: FloatArray, rack: RackModel, wind
     T = top_frame(T_camera_rack, rack)
     points_m = np.ascontiguousarray(points_m, float)
     reach_m, through_m = rack.outline_m / 2 + BESIDE_M, max(THROUGH_M, 2 * window_m)
-    return Labels(*view_kernels.labelled(points_m, T[:3, :3], T[:3, 3], camera_place(T), reach_m, window_m, through_m))
+    return Labels(*view_kernels.labelled(points_m, *parts(T), camera_place(T), reach_m, window_m, through_m))
 
 
 def camera_place(T_camera_frame: FloatArray) -> FloatArray:

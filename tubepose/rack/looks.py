@@ -9,7 +9,7 @@ from tubepose.rack import view_kernels as view_kernels
 from tubepose.rack.evidence import likelier_step_m
 from tubepose.rack.fit import HOPELESS_SHARE, RoughFit, camera_place, rack_frame, roughly, top_frame
 from tubepose.rack.pose import MIN_POINTS
-from tubepose.transforms import FloatArray, translation
+from tubepose.transforms import FloatArray, parts, translation
 
 # A rack full of caps shows its lattice better than its ends: so many slots may the search be off.
 SLOT_STEPS = 6
@@ -27,7 +27,7 @@ def seen_near(points_m: FloatArray, T_camera_rack: FloatArray, rack: RackModel) 
     """
     T = top_frame(T_camera_rack, rack)
     points_m = np.ascontiguousarray(points_m, float)
-    near_m = view_kernels.seen_through(points_m, T[:3, :3], T[:3, 3], camera_place(T), rack.outline_m / 2 + NEAR_M)
+    near_m = view_kernels.seen_through(points_m, *parts(T), camera_place(T), rack.outline_m / 2 + NEAR_M)
     return near_m if len(near_m) >= MIN_POINTS else points_m
 
 

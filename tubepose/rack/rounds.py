@@ -89,8 +89,8 @@ def square_counts(xy_m, side_m):
         cells[k, 0], cells[k, 1] = i, j
         low_x, low_y, high_x, high_y = min(low_x, i), min(low_y, j), max(high_x, i), max(high_y, j)
     counts = np.zeros((high_x - low_x + 1, high_y - low_y + 1), np.intp)
-    for i, j in cells:
-        counts[i - low_x, j - low_y] += 1
+    for k in range(len(xy_m)):
+        counts[cells[k, 0] - low_x, cells[k, 1] - low_y] += 1
     found = np.empty(len(xy_m), np.intp)
     for k in range(len(xy_m)):
         found[k] = counts[cells[k, 0] - low_x, cells[k, 1] - low_y]
@@ -105,15 +105,21 @@ def cluster_sums(xy_m, scores, side_m):
         i, j = math.floor(xy_m[k, 0] / side_m), math.floor(xy_m[k, 1] / side_m)
         low_x, low_y, high_x, high_y = min(low_x, i), min(low_y, j), max(high_x, i), max(high_y, j)
     rows = high_y - low_y + 1
-    sums = np.zeros(((high_x - low_x + 1) * rows, scores.shape[1]))
-    filled = np.zeros(len(sums), np.bool_)
+    columns = scores.shape[1]
+    sums, products = np.zeros(((high_x - low_x + 1) * rows, columns)), np.zeros((columns, columns))
+    filled, count = np.zeros(len(sums), np.bool_), 0
     for k in range(len(xy_m)):
         i, j = math.floor(xy_m[k, 0] / side_m), math.floor(xy_m[k, 1] / side_m)
         cell = (i - low_x) * rows + j - low_y
         filled[cell] = True
-        for m in range(scores.shape[1]):
+        for m in range(columns):
             sums[cell, m] += scores[k, m]
-    return sums.T @ sums, filled.sum()
+    for cell in range(len(sums)):
+        count += filled[cell]
+        for m in range(columns):
+            for n in range(columns):
+                products[m, n] += sums[cell, m] * sums[cell, n]
+    return products, count
 
 
 @compiled
@@ -146,18 +152,25 @@ def plane_steps(points_m, balance, widths_m, held):
     the level is held, the height alone moves.
     """
     stiff = 1e9 if held else 1e-9
-    found = np.array([0.0, 0.0, densest(points_m[:, 2], widths_m[0])])
+    found, normal = np.zeros(3), np.zeros((3, 3))
     off, scores = np.empty(len(points_m)), np.zeros((len(points_m), 3))
+    for k in range(len(points_m)):
+        off[k] = points_m[k, 2]
+    found[2] = densest(off, widths_m[0])
     scatter = widths_m[0]
-    normal = np.zeros((3, 3))
     reach = scatter
     for width in widths_m:
         for k in range(len(points_m)):
             off[k] = points_m[k, 2] - points_m[k, 1] * found[0] + points_m[k, 0] * found[1] - found[2]
         scatter = 1.4826 * median_size(off, max(width, 2 * scatter))
         reach = max(width, min(2 * scatter, WIDEST_M))
-        normal = np.diag(np.array([stiff, stiff, 1e-6]))
-        found = found + solved(normal, plane_step(points_m, off, balance, reach, normal))
+        for i in range(3):
+            for j in range(3):
+                normal[i, j] = 0.0
+        normal[0, 0], normal[1, 1], normal[2, 2] = stiff, stiff, 1e-6
+        step = solved(normal, plane_step(points_m, off, balance, reach, normal))
+        for i in range(3):
+            found[i] += step[i]
     for k in range(len(points_m)):
         u = off[k] / reach
         if abs(u) < 1.0:
@@ -202,9 +215,16 @@ def edge_step(points_m, distance_m, slope, window_m, blur_m, count):
 def edge_move(local_m, distance_m, slope, window_m, blur_m, count):
     """One step of Fisher scoring about yaw, shift and, for `count` 5, stretch; `edge_step` that it is made from."""
     information, scores, xy = edge_step(local_m, distance_m, slope, window_m, blur_m, count)
-    information = information + np.diag(np.array([1e1, 1e5, 1e5, 1e1, 1e1])[:count])
-    step = solved(information, scores.sum(axis=0))
-    return step * min(1.0, LONGEST_STEP_M / max(abs(step[1]), abs(step[2]), 1e-12)), (information, scores, xy)
+    total = np.zeros(count)
+    for i in range(count):
+        information[i, i] += 1e5 if 1 <= i <= 2 else 1e1
+        for k in range(len(scores)):
+            total[i] += scores[k, i]
+    step = solved(information, total)
+    share = min(1.0, LONGEST_STEP_M / max(abs(step[1]), abs(step[2]), 1e-12))
+    for i in range(count):
+        step[i] *= share
+    return step, (information, scores, xy)
 
 
 @compiled
@@ -219,14 +239,19 @@ def round_step(points_m, rotation, origin_m, window_m, blur_m, widths_m, held, l
     """
     height_m = max(window_m, widths_m[0])
     local, distance, slope = laid(points_m, rotation, origin_m, height_m, low_m, cell_m, shape, table)
-    inside = local[distance < -INSIDE_M]
-    balance = 1.0 / np.maximum(square_counts(inside, SHARED_LENGTH_M), FULL_SQUARE)
-    plane = plane_steps(inside, balance, widths_m, held)
-    astray, total = 0, 0
+    inside, count, astray, total = np.empty((len(local), 3)), 0, 0, 0
     for k in range(len(local)):
+        if distance[k] < -INSIDE_M:
+            inside[count, 0], inside[count, 1], inside[count, 2] = local[k, 0], local[k, 1], local[k, 2]
+            count += 1
         if abs(local[k, 2]) < window_m:
             total += 1
             astray += distance[k] > STRAY_M
+    inside = inside[:count]
+    crowd, balance = square_counts(inside, SHARED_LENGTH_M), np.empty(count)
+    for k in range(count):
+        balance[k] = 1.0 / max(crowd[k], FULL_SQUARE)
+    plane = plane_steps(inside, balance, widths_m, held)
     return plane, inside, edge_move(local, distance, slope, window_m, blur_m, 3), astray / total
 
 
@@ -236,19 +261,22 @@ def stretched(xy_m, low_m, cell_m, shape, table):
 
     Where that ends among other slots, too little is seen to tell: then it is what the first step says.
     """
-    moved, places = np.zeros(5), np.zeros((len(xy_m), 3))
+    moved, places, still, origin_m = np.zeros(5), np.zeros((len(xy_m), 3)), np.zeros((3, 3)), np.zeros(3)
+    for i in range(3):
+        still[i, i] = 1.0
     for turn in range(STRETCH_ROUNDS):
         for k in range(len(xy_m)):
             x, y = xy_m[k, 0] - moved[1], xy_m[k, 1] - moved[2]
             places[k, 0] = (x + moved[0] * y) / (1.0 + moved[3])
             places[k, 1] = (y - moved[0] * x) / (1.0 + moved[4])
-        local, distance, slope = laid(places, np.eye(3), np.zeros(3), np.inf, low_m, cell_m, shape, table)
+        local, distance, slope = laid(places, still, origin_m, np.inf, low_m, cell_m, shape, table)
         step, edges = edge_move(local, distance, slope, np.inf, STRETCH_BLUR_M, 5)
         # Far from the middle a stretch moves edges as a shift does: no step is longer than edges are seen from.
         farthest = 0.5 * cell_m * max(abs(step[3]) * shape[0], abs(step[4]) * shape[1])
-        moved = moved + step * min(1.0, LONGEST_STEP_M / max(farthest, 1e-12))
+        for i in range(5):
+            moved[i] += step[i] * min(1.0, LONGEST_STEP_M / max(farthest, 1e-12))
         if turn == 0:
-            first, first_edges = moved, edges
+            first, first_edges = moved.copy(), edges
         if max(abs(moved[3]), abs(moved[4])) > LOST_STRETCH:
             return first, first_edges
         if max(abs(step[3]), abs(step[4])) < SETTLED_STRETCH:

@@ -20,7 +20,7 @@ from tubepose.labware import RackModel
 from tubepose.preprocessing import thin
 from tubepose.rack import kernels as kernels
 from tubepose.rack.field import top_field
-from tubepose.transforms import FloatArray, make_transform, translation
+from tubepose.transforms import FloatArray, make_transform, parts, translation
 
 # What stands out of a rack is looked for from here to there above its top, and this near the axis of its slot.
 LOW_M, HIGH_M = 5e-3, 0.15
@@ -121,7 +121,7 @@ def _rows_differ(centers_m: FloatArray, off_m: FloatArray) -> bool:
 
 def _tops(points_m: FloatArray, T_camera_top: FloatArray, rack: RackModel) -> tuple[FloatArray, FloatArray, bool]:
     """Centres (K, 2) of slots with a top above them, its height (K,) above the rack's; whether they hang together."""
-    R, origin_m, centers = T_camera_top[:3, :3], T_camera_top[:3, 3], rack.slot_centers_m
+    (R, origin_m), centers = parts(T_camera_top), rack.slot_centers_m
     points_m = np.ascontiguousarray(points_m, float)
     above_m = kernels.in_box(points_m, R, origin_m, rack.outline_m / 2, LOW_M, HIGH_M)
     few_m = thin(above_m, POINTS_PER_SLOT * len(centers))
