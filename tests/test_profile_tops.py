@@ -8,6 +8,9 @@ from tubepose.labware import load_rack, load_tube
 from tubepose.profile.measure import NEAR_TOP_M, label_points
 from tubepose.profile.standing import Standing
 from tubepose.profile.tops import (
+    _scores_in,
+    _top_score,
+    _windows,
     find_tops,
     mouth_radius_m,
     top_depth_m,
@@ -168,3 +171,19 @@ def test_without_tops_no_point_has_a_label():
     points = Standing(np.zeros((4, 3)), CAMERA_M)
     assert label_points(points, np.empty((0, 2)), np.empty(0)).tolist() == [-1] * 4
     assert label_points(Standing(np.empty((0, 3)), CAMERA_M), np.zeros((1, 2)), np.ones(1) * 0.01).shape == (0,)
+
+
+@pytest.mark.parametrize("tube", TUBES, ids=lambda tube: tube.name)
+@pytest.mark.parametrize("wanted", [[0], [7, 24, 49], range(50)], ids=["a corner", "three", "all"])
+def test_a_picture_has_the_same_scores_where_few_slots_want_them(tube, wanted):
+    rng = np.random.default_rng(1)
+    windows = _windows(RACK, tube, CONFIG.reach_m)
+    shape = tuple(windows[1].max(axis=0) + 3)
+    filled = (rng.random(shape) < 0.7).astype(np.float32)
+    off_m = np.where(filled > 0, rng.normal(0, 3e-4, shape), 0).astype(np.float32)
+    chosen = np.isin(np.arange(len(NAMES)), wanted)
+    found = _scores_in(windows, chosen, filled, off_m, tube, CONFIG)
+    whole = _top_score(filled, off_m, tube, CONFIG)
+    for low, high in zip(windows[0][chosen], windows[1][chosen], strict=True):
+        own = tuple(slice(max(a, 0), b) for a, b in zip(low, high, strict=True))
+        np.testing.assert_allclose(found[own], whole[own], atol=1e-5)

@@ -15,7 +15,7 @@ from tubepose.labware import RackModel, TubeModel
 from tubepose.profile.faint_rims import RimSearch, find_faint_rims
 from tubepose.profile.kernels import cell_values, ends_on_planes, near_planes, nearest_tops
 from tubepose.profile.outline import NORMALS, OUTLINE_DEPTH_M, SECTORS, Circles, fit_discs, unknown_circles
-from tubepose.profile.plane import TopPlanes, fit_top_planes
+from tubepose.profile.plane import TopPlanes, fit_top_planes, unknown_planes
 from tubepose.profile.rims import RimView, fit_rims, rim_view
 from tubepose.profile.standing import Standing, gather_standing
 from tubepose.profile.tops import (
@@ -112,8 +112,10 @@ def measure_tops(
         tops, rims = _with_others(*found, *rest, rack, tubes)
     shape = _shapes(tops, tubes, rack)
     label = label_points(standing, tops.center_m, shape.radius_m)
-    planes, discs = _measure_closed(standing, label, tops, shape, config.profile)
-    circles = discs.where(~shape.open, rims)
+    planes, circles = unknown_planes(len(shape.open)), rims
+    if not shape.open.all():
+        planes, discs = _measure_closed(standing, label, tops, shape, config.profile)
+        circles = discs.where(~shape.open, rims)
     level = np.where(np.isfinite(planes.height_m), planes.height_m, shape.level_m)
     return Measured(tops, tops.center_m + circles.offset_m, level, planes, circles, label, standing)
 

@@ -77,6 +77,12 @@ def fit_top_planes(
     )
 
 
+def unknown_planes(count: int) -> TopPlanes:
+    """Planes that nothing is known of."""
+    nothing = np.full(count, np.nan)
+    return TopPlanes(nothing, np.full((count, 2), np.nan), nothing, nothing, np.zeros(count, np.intp))
+
+
 def top_spacing_m(planes: TopPlanes, radius_m: FloatArray) -> FloatArray:
     """How far apart the points of tops of these radii (T,) lie, shape (T,), metres; NaN without a plane."""
     area_m2 = np.pi * np.maximum(radius_m - EDGE_M, 0.0) ** 2

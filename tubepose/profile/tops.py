@@ -19,6 +19,8 @@ from tubepose.profile.standing import OUTSIDE_M, Standing
 from tubepose.transforms import FloatArray
 
 CELL_M = 1.0e-3
+FEW_WINDOWS = 8
+"""A picture is scored as a whole for more slots than these."""
 PASSES = 3
 PICTURE_POINTS = 40_000
 CLOSE, NEAR = 0.03, 3.5
@@ -113,7 +115,8 @@ def find_tops(
         found = np.full((len(tubes), count, 3), -np.inf)
         for k, tube in enumerate(tubes):
             windows = _windows(rack, tube, config.reach_m)
-            found[k] = best_places(_top_score(*pictures[k], tube, config), *windows, may[k] & left, CLOSE, NEAR)
+            score = _scores_in(windows, may[k] & left, *pictures[k], tube, config)
+            found[k] = best_places(score, *windows, may[k] & left, CLOSE, NEAR)
             found[k, :, 1:] = found[k, :, 1:] * CELL_M - rack.outline_m / 2 - OUTSIDE_M
         ranked = np.sort(found[:, :, 0], axis=0)
         kind = found[:, :, 0].argmax(axis=0)
@@ -182,6 +185,28 @@ def _top_score(
     return np.asarray(score * np.exp(-0.5 * (mean_off_m / (2 * config.cap_height_m)) ** 2), np.float32)
 
 
+def _scores_in(
+    windows: tuple[NDArray[np.intp], NDArray[np.intp]],
+    wanted: NDArray[np.bool_],
+    filled: NDArray[np.float32],
+    off_m: NDArray[np.float32],
+    tube: TubeModel,
+    config: ProfileConfig,
+) -> NDArray[np.float32]:
+    """`_top_score` of a picture where some windows, `low` (S, 2) to `high`, want it: of all of it, where many do."""
+    if wanted.sum() > FEW_WINDOWS:
+        return _top_score(filled, off_m, tube, config)
+    score = np.full(filled.shape, -np.inf, np.float32)
+    reach = len(_top_kernels(tube)[0]) // 2
+    for low, high in zip(*(np.clip(ends[wanted], 0, filled.shape) for ends in windows), strict=True):
+        first = np.maximum(low - reach, 0)
+        near = tuple(slice(a, b + reach) for a, b in zip(first, high, strict=True))
+        inner = tuple(slice(a, b) for a, b in zip(low - first, high - first, strict=True))
+        own = tuple(slice(a, b) for a, b in zip(low, high, strict=True))
+        score[own] = _top_score(filled[near], off_m[near], tube, config)[inner]
+    return score
+
+
 @lru_cache(maxsize=64)
 def _top_kernels(tube: TubeModel) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """What a picture is filtered with: weights of the cells about the middle of a top, and which ones are the top."""
@@ -244,6 +269,9 @@ def without_overlaps(
     rows = np.concatenate([taken, slots[np.argsort(-place[slots, 0], kind="stable")]])
     radius, at = np.array([top_radius_m(tube) for tube in tubes])[kind[rows]], place[rows, 1:]
     clear = np.hypot(*(at[:, None] - at).T) > 0.75 * (radius[:, None] + radius)
+    np.fill_diagonal(clear, True)
+    if clear.all():
+        return np.sort(slots)
     kept = np.arange(len(rows)) < len(taken)
     for row in range(len(taken), len(rows)):
         kept[row] = clear[row, kept].all()
