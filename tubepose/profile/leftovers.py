@@ -65,7 +65,8 @@ def find_leftovers(
     # Close the gaps of coarse scans, then drop what is thinner than 5 mm: walls' ghosts, slivers beside tops.
     solid = cv2.morphologyEx(picture, cv2.MORPH_CLOSE, np.ones((3, 3), np.uint8))
     solid = cv2.morphologyEx(solid, cv2.MORPH_OPEN, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (5, 5)))
-    count, groups = cv2.connectedComponents(solid)
+    count, found_groups = cv2.connectedComponents(solid)
+    groups = np.asarray(found_groups, np.int32)
     points_of = _by_group(groups[cells[:, 0], cells[:, 1]], count)
     cells_of = _by_group(groups.ravel(), count)
     pitch = float(rack.pitches_m.min())
