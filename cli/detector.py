@@ -159,7 +159,9 @@ def evaluate(
     map_: Annotated[
         list[str] | None,
         typer.Option(
-            "--map", metavar="NAME=tube|rack|ignore", help="What a class of the labels is, else its name says."
+            "--map",
+            metavar="NAME=tube|rack|ignore",
+            help="What a class of the labels is, else its name says; once for each class.",
         ),
     ] = None,
     score: Annotated[float, typer.Option(min=0, max=1, help="Score from which a box is an answer.")] = 0.3,

@@ -77,10 +77,10 @@ def say(text: str) -> None:
 
 
 def say_when_compiling() -> None:
-    """One line before loops are compiled: it takes a while, and happens once on a machine."""
+    """One line before loops are compiled: it takes a while, and the machine code is kept."""
     from tubepose.compiled import before_compiling
 
-    before_compiling(lambda: say("compiling for this machine, once: about a minute"))
+    before_compiling(lambda: say("compiling for this machine: up to a minute; it is kept, so later runs begin at once"))
 
 
 def show_table(table: pd.DataFrame, title: str, notes: Sequence[str] = ()) -> None:

@@ -51,7 +51,7 @@ ALLOWED: dict[str, set[str]] = {
     },
     "stage_times": set(),
     "records": {"capture", "pipeline", "pose_errors", "rack", "slots"},
-    "batch": {"capture", "config", "labware", "detection", "rack", "pipeline", "records"},
+    "batch": {"capture", "compiled", "config", "labware", "detection", "rack", "pipeline", "records"},
     "ground_truth": {"capture", "labware"},
     "simulation": {"capture", "labware"},
     "statistics": set(),

@@ -10,6 +10,7 @@ import pandas as pd
 import pytest
 import scenes
 
+from tubepose import batch
 from tubepose.batch import MOST_ASKED, Job, Tables, UnnamedJob, run_jobs, session_jobs, trial_capture
 from tubepose.capture.frame import RgbdFrame
 from tubepose.capture.session import Session, SlotHint, load_session
@@ -132,6 +133,21 @@ def test_warm_up_goes_on_until_there_were_tubes() -> None:
     tables = run(job("empty", empty), job("good", GOOD), job("good", GOOD), warm_up=True)
     tubes = [row["warmup"] for row in tables.timings if row["stage"] == "tube"]
     assert tubes == [True, False, False]
+
+
+def test_every_set_of_types_is_warmed_up() -> None:
+    other = replace(job("other", GOOD), tubes=(TUBE.model_copy(update={"name": "other"}),))
+    tables = run(job("good", GOOD), job("good", GOOD), other, other, warm_up=True)
+    tubes = [row["warmup"] for row in tables.timings if row["stage"] == "tube"]
+    assert tubes == [True, False, False, True, False, False]
+
+
+def test_times_of_a_frame_in_which_code_is_compiled_are_marked(monkeypatch: pytest.MonkeyPatch) -> None:
+    counts = iter([0, 0, 0, 3])  # before and after each of two frames
+    monkeypatch.setattr(batch, "compilations", lambda: next(counts))
+    tables = run(job("good", GOOD), job("late", GOOD), warm_up=True)
+    tubes = [row["warmup"] for row in tables.timings if row["stage"] == "tube"]
+    assert tubes == [True, False, True]
 
 
 def test_our_own_bugs_are_not_kept_as_problems() -> None:

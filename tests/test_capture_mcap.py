@@ -584,7 +584,7 @@ def test_file_cut_anywhere_ends_in_one_clear_error(tmp_path_factory, keep):
     record(path, [*clouds([0, 100]), *shots([0, 100])], chunk_size=1024)
     whole = path.read_bytes()
     path.write_bytes(whole[: int((len(whole) - 1) * keep)])
-    with pytest.raises(CaptureError, match=r"truncated after|expected an MCAP file"):
+    with pytest.raises(CaptureError, match=r"truncated (after|before)|expected an MCAP file"):
         read_all(path)
 
 

@@ -315,7 +315,7 @@ def test_a_batch_with_bad_captures_names_each_in_one_line_and_does_the_good(dama
     ended = tubepose("estimate", damaged, *KNOWN, "--method", "upright", "--no-overlays", "--out", tmp_path / "out")
     assert (ended.code, ended.out, "Traceback" in ended.err) == (1, "", False)
     wanted = (
-        ("b-cut.mcap", "truncated after 0 whole frame", "record it again"),
+        ("b-cut.mcap", "truncated before the end of its first frame", "record it again"),
         ("c-missing/scan.ply", "no such file"),
         ("d-mm-as-m", "1000 times larger", "unit"),
         ("e-m-as-mm", "1000 times smaller", "unit"),

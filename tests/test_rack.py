@@ -98,7 +98,7 @@ def test_a_hint_far_from_both_places_decides_nothing(soft_scan):
         assert (pose.ambiguous, pose.resolved_by) == (True, "rule")
         said = re.fullmatch(
             rf"the hint says that A1 is seen at {pixel[0]:.0f},{pixel[1]:.0f}, but it is at (-?\d+),(-?\d+) or, "
-            r"the rack turned, at (-?\d+),(-?\d+): point nearer to one of them",
+            r"the rack turned, at (-?\d+),(-?\d+): point nearer to one of them, in pixels of the capture's image .*",
             pose.hint_note,
         )
         assert said

@@ -109,6 +109,15 @@ def test_twice_the_pitch_of_a_rack_whose_last_opening_is_near_its_edge_is_told_o
     assert "slots 22 x 23 mm apart explain the points better" in pose.reason
 
 
+@pytest.mark.parametrize("factor", [1e3, 1e-3], ids=["millimetres as metres", "metres as millimetres"])
+def test_a_wrong_unit_is_suspected_where_no_rack_is_named(factor):
+    points, _ = scan(SOFT)
+    lattice = SlotLattice((18.5, 17.7), SlotShape(shape="square", size_mm=(16.5, 16.5), corner_radius_mm=0))
+    for pose in (name_rack(points * factor, CONFIG)[0], register_grid(points * factor, lattice, CONFIG)):
+        assert pose.status is RackStatus.UNIT
+        assert "--unit" in pose.reason
+
+
 def test_slots_of_another_pitch_are_not_found():
     lattice = SlotLattice((22.0, 15.0), SlotShape(shape="square", size_mm=(12.0, 12.0)))
     pose = register_grid(scan(SOFT)[0], lattice, CONFIG)

@@ -198,9 +198,14 @@ def test_the_floor_in_words() -> None:
 def test_refusals_in_words() -> None:
     def truth(*reasons: str) -> pd.DataFrame:
         status = ["refused" if reason else "ok" for reason in reasons]
-        return pd.DataFrame({"status": pd.Series(status, dtype="str"), "reason": pd.Series(reasons, dtype="str")})
+        slots = [f"A{k + 1}" for k in range(len(reasons))]
+        columns = {"trial": ["007"] * len(reasons), "slot": slots, "status": status, "reason": reasons}
+        return pd.DataFrame({name: pd.Series(list(values), dtype="str") for name, values in columns.items()})
 
     assert refused_note(truth()) == "Ground truth: 0 caps measured, 0 refused."
     assert refused_note(truth("", "")) == "Ground truth: 2 caps measured, 0 refused."
-    assert refused_note(truth("", "bent", "bent", "")) == "Ground truth: 2 caps measured, 2 refused (bent)."
-    assert refused_note(truth("d", "c", "b", "a")).endswith("4 refused (a; b; c; ...).")
+    assert (
+        refused_note(truth("", "bent", "bent", ""))
+        == "Ground truth: 2 caps measured, 2 refused (bent: 007 A2 and 1 more)."
+    )
+    assert refused_note(truth("d", "c", "b", "a")).endswith("4 refused (a: 007 A4; b: 007 A3; c: 007 A2; ...).")

@@ -13,6 +13,7 @@ from functools import partial
 from tubepose.capture.frame import RgbdFrame
 from tubepose.capture.session import Session, SlotHint, Trial
 from tubepose.capture.source import Capture, open_captures
+from tubepose.compiled import compilations
 from tubepose.config import Config
 from tubepose.detection import Detector
 from tubepose.errors import CaptureError, TubePoseError, is_interrupt, kept
@@ -78,7 +79,7 @@ class UnnamedJob:
 
 
 MOST_WARMED = 5
-"""Frames that are run twice at most where none has a tube."""
+"""Frames of one kind that are run twice at most where none has a tube."""
 
 
 @dataclass(slots=True)
@@ -161,7 +162,8 @@ def run_jobs(
         detector_for: Makes the source of boxes for a rack and the tubes that can stand in it.
         config: All sections.
         seeds: Seeds of a stochastic method: 0, 1, ... (a deterministic method runs once).
-        warm_up: Run the first frame with tubes, and those before it, once more before, with their timings marked.
+        warm_up: Run the first frame with tubes of every set of types, and those before it, once more before, with their
+            timings marked; mark those of frames in which code is compiled, too.
         fail_fast: Raise the first problem instead of keeping it.
         on_scene: Called with each frame's result by one of the methods, ours if it is among them (overlays).
         on_done: Called after each job (progress).
@@ -170,18 +172,23 @@ def run_jobs(
     Raises:
         KeyboardInterrupt: The user stopped the run, in compiled code or not; `tables` hold the jobs that were done.
     """
-    tables, warmed = Tables() if tables is None else tables, 0
+    tables = Tables() if tables is None else tables
+    warmed: dict[tuple[TubeModel, ...], int] = {}
 
     def run(job: Job | UnnamedJob) -> None:
-        nonlocal warm_up, warmed
         for named, frame, load_ms in _named_frames(job, methods, tables):
-            if warm_up:
+            tries = warmed.get(named.tubes, 0)
+            if warm_up and tries < MOST_WARMED:
                 warm = Tables()
                 _run_frame(named, frame, methods, detector_for, config, seeds, warm, tables.timings)
-                warmed += 1
-                warm_up = not warm.estimates and warmed < MOST_WARMED  # a frame without tubes warms half of it
+                # A frame without tubes warms half of it.
+                warmed[named.tubes] = MOST_WARMED if warm.estimates else tries + 1
             load = StageTime("load", "all", "", None, load_ms)
+            rows, compiled = len(tables.timings), compilations()
             _run_frame(named, frame, methods, detector_for, config, seeds, tables, None, load, on_scene)
+            if warm_up and compilations() > compiled:
+                for row in tables.timings[rows:]:
+                    row["warmup"] = True
 
     for job in jobs:
         before = tables.lengths()

@@ -17,24 +17,35 @@ compiled = njit(cache=True, error_model="numpy")
 """The machine code is kept; a division by zero is infinity, as in NumPy."""
 
 
-class _Once(events.Listener):
-    """Tells of the first compilation."""
+class _Compilations(events.Listener):
+    """Counts what this process compiles; machine code that was kept needs none."""
 
-    def __init__(self, tell: Callable[[], object]) -> None:
-        self._tell, self._told = tell, False
+    def __init__(self) -> None:
+        self.count = 0
+        self.tell: Callable[[], object] | None = None
 
     def on_start(self, event: Any) -> None:  # noqa: ARG002
-        if not self._told:
-            self._told = True
-            self._tell()
+        self.count += 1
+        if self.tell is not None:
+            tell, self.tell = self.tell, None
+            tell()
 
     def on_end(self, event: Any) -> None:
         pass
 
 
+_COMPILATIONS = _Compilations()
+events.register("numba:compile", _COMPILATIONS)
+
+
+def compilations() -> int:
+    """How many loops this process has begun to compile."""
+    return _COMPILATIONS.count
+
+
 def before_compiling(tell: Callable[[], object]) -> None:
-    """Call a function before this process compiles its first loop; machine code that was kept needs no compiling."""
-    events.register("numba:compile", _Once(tell))
+    """Call a function before this process next compiles a loop, once; machine code that was kept needs no compiling."""
+    _COMPILATIONS.tell = tell
 
 
 @compiled

@@ -21,6 +21,8 @@ OUTLINE_OF_INTEREST_M = 0.02
 PATCH_RADIUS_M = 0.03
 PATCH_HALF_HEIGHT_M = 0.01
 UNIT_FACTORS = (10.0, 0.1, 1000.0, 0.001)
+PLAUSIBLE_M = (0.03, 30.0)
+"""What a capture with a rack in it spans, whatever the rack."""
 
 
 def to_o3d(points_m: FloatArray) -> o3d.geometry.PointCloud:
@@ -156,6 +158,18 @@ def _plane_scatter(points_m: FloatArray) -> float:
         off = np.abs((points_m - origin) @ normal)
         kept = points_m[off <= np.percentile(off, 70)]
     return float(1.4826 * np.median(off))
+
+
+def unit_doubt(points_m: FloatArray) -> str:
+    """Why a cloud's unit cannot be right, in words, whatever the rack; empty if it can."""
+    extent_m = float(np.ptp(np.percentile(points_m, [1, 99], axis=0), axis=0).max())
+    low_m, high_m = PLAUSIBLE_M
+    if low_m < extent_m < high_m:
+        return ""
+    return (
+        f"the points span {extent_m:.3g} m, {low_m:g} to {high_m:g} m expected: "
+        "is the unit (m or mm) of the capture declared right (--unit)?"
+    )
 
 
 def plausible_unit_factors(points_m: FloatArray, rack: RackModel) -> tuple[float, ...]:

@@ -200,6 +200,9 @@ def floor_note(floor: pd.DataFrame) -> str:
 def refused_note(truth: pd.DataFrame) -> str:
     """One sentence on how many caps gave no truth."""
     refused = truth[truth["status"] != "ok"]
-    reasons: Sequence[str] = sorted({str(reason) for reason in refused["reason"]})
-    listed = f" ({'; '.join(reasons[:3])}{'; ...' if len(reasons) > 3 else ''})" if len(reasons) else ""
+    told = []
+    for reason, rows in sorted(refused.groupby("reason")):
+        first, more = rows.iloc[0], f" and {len(rows) - 1} more" if len(rows) > 1 else ""
+        told.append(f"{reason}: {first['trial']} {first['slot']}{more}")
+    listed = f" ({'; '.join(told[:3])}{'; ...' if len(told) > 3 else ''})" if told else ""
     return f"Ground truth: {len(truth) - len(refused)} caps measured, {len(refused)} refused{listed}."

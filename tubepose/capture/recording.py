@@ -46,11 +46,11 @@ class Recording:
     def broken_text(self, path: Path, frames: int) -> str:
         """One line about the cut, with the number of frames before it."""
         cut = isinstance(self.broken, EndOfFile | RecordLengthLimitExceeded | struct.error)
-        reason = f" ({self.broken})" if str(self.broken) else ""
-        return (
-            f"{path}: truncated{'' if cut else ' or damaged'} after {frames} whole frame(s){reason}; "
-            "copy or record it again to have the rest"
-        )
+        reason = f" ({self.broken})" if str(self.broken) and not isinstance(self.broken, struct.error) else ""
+        what = "truncated" if cut else "truncated or damaged"
+        if frames == 0:
+            return f"{path}: {what} before the end of its first frame{reason}; copy or record it again"
+        return f"{path}: {what} after {frames} whole frame(s){reason}; copy or record it again to have the rest"
 
 
 @dataclass(frozen=True, slots=True, eq=False)

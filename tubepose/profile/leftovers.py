@@ -102,9 +102,8 @@ def _judge(
     (_, _), sides, _ = cv2.minAreaRect(cells.astype(np.float32))
     length_m, width_m = max(sides) * CELL_M, min(sides) * CELL_M
     if length_m > LYING_PITCHES * pitch_m and width_m > 6e-3:
-        return Leftover(
-            None, f"lies across the rack: {length_m * 1e3:.0f} x {width_m * 1e3:.0f} mm seen from above", rows
-        )
+        size = f"{length_m * 1e3:.0f} x {width_m * 1e3:.0f} mm"
+        return Leftover(None, f"lies across the rack: {size} seen from above, if no unknown tops touch", rows)
     place_m = cells.mean(axis=0) * CELL_M - half
     distance = np.linalg.norm(rack.slot_centers_m - place_m, axis=1)
     slot = int(distance.argmin())

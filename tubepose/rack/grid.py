@@ -17,6 +17,7 @@ from scipy import ndimage
 from tubepose.capture.frame import CameraIntrinsics
 from tubepose.config import Config
 from tubepose.labware import RackModel
+from tubepose.preprocessing import unit_doubt
 from tubepose.rack.edges import coarse_sample, pose_of
 from tubepose.rack.fit import to_frame, top_frame
 from tubepose.rack.lattice import SlotLattice, countable, other_pitch
@@ -74,7 +75,9 @@ def register_grid(
             break
     if not found:
         told = " x ".join(f"{side:g}" for side in lattice.pitch_mm)
-        return RackPose(RackStatus.NOT_FOUND, f"no slots {told} mm apart among the points")
+        doubt = unit_doubt(points_m)
+        none = f"no slots {told} mm apart among the points: measure --pitch over as many slots as there are"
+        return RackPose(RackStatus.UNIT if doubt else RackStatus.NOT_FOUND, doubt or none)
     rack, best = max(found, key=lambda pair: (not pair[1].reason, pair[1].agreement.evidence))
     beside = _tubes_beside(points_m, best, rack, lattice)
     if not best.reason and beside > MOST_BESIDE:

@@ -9,6 +9,7 @@ from tubepose.capture.frame import CameraIntrinsics
 from tubepose.capture.session import SlotHint
 from tubepose.config import Config
 from tubepose.labware import RackModel, catalogue
+from tubepose.preprocessing import unit_doubt
 from tubepose.rack.edges import best_registration, coarse_sample, pose_of
 from tubepose.rack.pose import MIN_POINTS, RackPose, RackStatus
 from tubepose.rack.search import levels
@@ -72,7 +73,8 @@ def name_rack(
     ranking = tuple(RankedRack(rack, best.agreement.evidence, best.reason) for rack, best in order)
     reason = _not_named(ranking, len(racks), config)
     if reason:
-        return RackPose(RackStatus.REFUSED, reason), ranking
+        doubt = unit_doubt(points_m)
+        return RackPose(RackStatus.UNIT if doubt else RackStatus.REFUSED, doubt or reason), ranking
     rack, best = order[0]
     if hint is not None and not rack.has_slot(hint.slot):
         hint = None
@@ -83,9 +85,10 @@ def name_rack(
 def _not_named(ranking: Sequence[RankedRack], known: int, config: Config) -> str:
     """Why no rack can be named, in words; empty if the first one is it."""
     if not ranking or ranking[0].reason:
-        told = ", ".join(f"{entry.rack.name} ({entry.reason.split('; ')[0]})" for entry in ranking[:TOLD])
+        near = ", ".join(f"{entry.rack.name} ({entry.reason.split('; ')[0]})" for entry in ranking[:TOLD])
         return (
-            f"no rack of the {known} known ones fits; the nearest are {told or 'none: there is no level band at all'}; "
+            f"no rack of the {known} known ones fits; "
+            f"{f'the nearest are {near}' if near else 'no level top is among the points'}; "
             "give your own by --rack FILE, or --rack grid with --pitch and --slot"
         )
     if ranking[0].evidence >= config.rack.min_rival_ratio * _rival(ranking):

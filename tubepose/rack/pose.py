@@ -120,7 +120,8 @@ def unused_hint(
     (u, v), (other_u, other_v) = _hinted(T_camera_best, T_camera_turned, rack, hint, intrinsics)
     return (
         f"the hint says that {hint.slot} is seen at {hint.pixel[0]:.0f},{hint.pixel[1]:.0f}, but it is at "
-        f"{u:.0f},{v:.0f} or, the rack turned, at {other_u:.0f},{other_v:.0f}: point nearer to one of them"
+        f"{u:.0f},{v:.0f} or, the rack turned, at {other_u:.0f},{other_v:.0f}: point nearer to one of them, in "
+        "pixels of the capture's image (an overlay is cut and scaled)"
     )
 
 

@@ -79,6 +79,6 @@ def _unit_suspicion(points_m: FloatArray, rack: RackModel, config: Config, metho
             return (
                 f"a rack of this shape is there, but {size} than {rack.name} ({outline_words(rack)} mm): "
                 f"is the unit{' (m or mm)' if max(factor, 1 / factor) > 100 else ' or depth_scale_m'} of the capture "
-                "declared right?"
+                "declared right (--unit)?"
             )
     return ""
