@@ -249,12 +249,13 @@ def test_slot_names_are_unique(tmp_path: Path) -> None:
     [
         (tube_data(wall_mm=7), "leaves no room"),
         (tube_data(bottom="conical"), "cone_height_mm goes with"),
-        (tube_data(height_mm=6), "the bottom is higher"),
+        (tube_data(height_mm=6), "is not below height_mm 6: is all of it in millimetres?"),
+        (tube_data(height_mm=0.098), "5 mm high or more, found height_mm 0.098: is it in metres?"),
         (tube_data() | {"cap": {"diameter_mm": 15, "height_mm": 5, "top_mm": 0}}, "cap diameter_mm 15.0 is not more"),
         (tube_data(optics={"scattering_per_mm": 0.4}), "optics are those of a see-through wall"),
         (tube_data(material="translucent", optics={"refractive_index": 0.9}), r"body\.optics\.refractive_index.*0\.9"),
         (tube_data(material="translucent", optics={"scattering": 0.4}), r"unknown key 'body\.optics\.scattering'"),
-        (tube_data() | {"cap": {"diameter_mm": 18, "height_mm": 99, "top_mm": 1}}, "reaches below the body's wall"),
+        (tube_data() | {"cap": {"diameter_mm": 18, "height_mm": 99, "top_mm": 1}}, "the cap is 99 mm high, and"),
         (tube_data() | {"cap": {"diameter_mm": 18, "height_mm": 5, "top_mm": 1, "open": True}}, "top_mm must be 0"),
     ],
 )

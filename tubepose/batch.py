@@ -163,7 +163,7 @@ def run_jobs(
         config: All sections.
         seeds: Seeds of a stochastic method: 0, 1, ... (a deterministic method runs once).
         warm_up: Run the first frame with tubes of every set of types, and those before it, once more before, with their
-            timings marked; mark those of frames in which code is compiled, too.
+            timings marked. Those of frames in which code is compiled always are.
         fail_fast: Raise the first problem instead of keeping it.
         on_scene: Called with each frame's result by one of the methods, ours if it is among them (overlays).
         on_done: Called after each job (progress).
@@ -186,7 +186,7 @@ def run_jobs(
             load = StageTime("load", "all", "", None, load_ms)
             rows, compiled = len(tables.timings), compilations()
             _run_frame(named, frame, methods, detector_for, config, seeds, tables, None, load, on_scene)
-            if warm_up and compilations() > compiled:
+            if compilations() > compiled:
                 for row in tables.timings[rows:]:
                     row["warmup"] = True
 

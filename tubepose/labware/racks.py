@@ -165,7 +165,8 @@ class RackModel(Definition):
             raise ValueError(f"slot names must be unique, found twice: {', '.join(doubled)}")
         widest = max(max(slot.size_mm) for slot in self.all_slots)
         if self.floor_play_mm > widest / 2:
-            raise ValueError(f"floor_play_mm {self.floor_play_mm} is more than half of the widest slot, {widest:g} mm")
+            words = f"floor_play_mm {self.floor_play_mm} is more than half of the widest slot, {widest:g} mm"
+            raise ValueError(f"{words}: is all of it in millimetres?")
         half = np.array(self.outline_mm) / 2
         for slot in self.all_slots:
             if np.any(np.abs(slot.center_mm) + np.array(slot.size_mm) / 2 >= half):

@@ -69,6 +69,9 @@ class TubeBody(Definition):
 
     @model_validator(mode="after")
     def _check(self) -> TubeBody:
+        if self.height_mm < LEAST_TUBE_MM:
+            high = self.height_mm
+            raise ValueError(f"a tube is {LEAST_TUBE_MM:g} mm high or more, found height_mm {high}: is it in metres?")
         if self.optics is not None and self.material == "opaque":
             raise ValueError("optics are those of a see-through wall, but the body's material is opaque")
         if 2 * self.wall_mm >= min(self.bottom_diameter_mm, self.top_diameter_mm):
@@ -76,7 +79,8 @@ class TubeBody(Definition):
         if (self.bottom == "conical") != (self.cone_height_mm > 0):
             raise ValueError("cone_height_mm goes with bottom: conical, and only with it")
         if self.bottom_height_mm >= self.height_mm:
-            raise ValueError("the bottom is higher than the body")
+            words = f"{self.bottom_height_mm:g} mm, is not below height_mm {self.height_mm:g}"
+            raise ValueError(f"the {self.bottom} bottom's height, {words}: is all of it in millimetres?")
         return self
 
     @property
@@ -142,12 +146,10 @@ class TubeModel(Definition):
         if RACK_CLASS in (self.name, *self.classes):
             key = "classes" if RACK_CLASS in self.classes else "name"
             raise ValueError(f"{key}: '{RACK_CLASS}' is a detector's word for racks; give words for this tube")
-        if self.body.height_mm < LEAST_TUBE_MM:
-            high = self.body.height_mm
-            raise ValueError(f"a tube is {LEAST_TUBE_MM:g} mm high or more, found height_mm {high}: is it in metres?")
         if self.cap is not None:
             if self.cap.height_mm >= self.height_mm - self.body.bottom_height_mm:
-                raise ValueError("the cap reaches below the body's wall")
+                room = f"{self.height_mm - self.body.bottom_height_mm:g} mm are above the body's bottom"
+                raise ValueError(f"the cap is {self.cap.height_mm:g} mm high, and {room}: is all of it in millimetres?")
             if self.cap.diameter_mm <= self.body.top_diameter_mm:
                 raise ValueError(
                     f"cap diameter_mm {self.cap.diameter_mm} is not more than the body's {self.body.top_diameter_mm}"
