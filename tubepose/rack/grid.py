@@ -34,6 +34,7 @@ FOLD_M = 5e-4
 SLACK_M = 1.5e-3
 RASTER_M = 2e-3
 OUTLINE_SHARE = 0.03
+MEASURE = "are --pitch and --slot right? Measure the pitch over as many slots as there are"
 # What stands beside a rack as tubes stand in it: heights above its top, and the share that leaning tubes may have.
 STANDING_POINTS = 20_000
 STANDING_M = (5e-3, 0.15)
@@ -76,19 +77,25 @@ def register_grid(
     if not found:
         told = " x ".join(f"{side:g}" for side in lattice.pitch_mm)
         doubt = unit_doubt(points_m)
-        none = f"no slots {told} mm apart among the points: measure --pitch over as many slots as there are"
+        none = f"no slots {told} mm apart among the points; {MEASURE}"
         return RackPose(RackStatus.UNIT if doubt else RackStatus.NOT_FOUND, doubt or none)
     rack, best = max(found, key=lambda pair: (not pair[1].reason, pair[1].agreement.evidence))
-    beside = _tubes_beside(points_m, best, rack, lattice)
-    if not best.reason and beside > MOST_BESIDE:
-        reason = (
-            f"{rack.name} was counted, and {beside:.0%} of what stands up stands beside it, at most {MOST_BESIDE:.0%} "
-            "expected: rows or columns are hidden; name the rack"
-        )
-        best = replace(best, reason=reason)
-    if not best.reason:
-        best = replace(best, reason=other_pitch(points_m, best, rack, lattice, config))
+    if best.reason:
+        pose = pose_of(best, points_m, rack, config, None, intrinsics)
+        return replace(pose, rack=rack, reason=f"{pose.reason}; {MEASURE}")
+    best = replace(best, reason=_miscounted(points_m, best, rack, lattice, config))
     return replace(pose_of(best, points_m, rack, config, None, intrinsics), rack=rack)
+
+
+def _miscounted(points_m: FloatArray, best: Registration, rack: RackModel, lattice: SlotLattice, config: Config) -> str:
+    """Why slots that fit are not all there are, or not as far apart as said, in words; empty if they are."""
+    beside = _tubes_beside(points_m, best, rack, lattice)
+    if beside > MOST_BESIDE:
+        return (
+            f"{rack.name} was counted, and {beside:.0%} of what stands up stands beside it, at most {MOST_BESIDE:.0%} "
+            "expected: rows or columns are hidden, or the pitch is another one; name the rack"
+        )
+    return other_pitch(points_m, best, rack, lattice, config)
 
 
 def _tubes_beside(points_m: FloatArray, best: Registration, rack: RackModel, lattice: SlotLattice) -> float:
