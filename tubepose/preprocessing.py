@@ -160,9 +160,14 @@ def _plane_scatter(points_m: FloatArray) -> float:
     return float(1.4826 * np.median(off))
 
 
+def _extent_m(points_m: FloatArray) -> float:
+    """Longest side of what nearly all points span, metres."""
+    return float(np.ptp(np.percentile(points_m, [1, 99], axis=0), axis=0).max())
+
+
 def unit_doubt(points_m: FloatArray) -> str:
     """Why a cloud's unit cannot be right, in words, whatever the rack; empty if it can."""
-    extent_m = float(np.ptp(np.percentile(points_m, [1, 99], axis=0), axis=0).max())
+    extent_m = _extent_m(points_m)
     low_m, high_m = PLAUSIBLE_M
     if low_m < extent_m < high_m:
         return ""
@@ -174,7 +179,7 @@ def unit_doubt(points_m: FloatArray) -> str:
 
 def plausible_unit_factors(points_m: FloatArray, rack: RackModel) -> tuple[float, ...]:
     """Factors by which a cloud could be too large (10, 1000) or too small (0.1, 0.001): a rack fits in, and no hall."""
-    extent_m = float(np.ptp(np.percentile(points_m, [1, 99], axis=0), axis=0).max())
+    extent_m = _extent_m(points_m)
     smallest, largest = 0.8 * float(rack.outline_m.min()), 6.0
     return tuple(factor for factor in UNIT_FACTORS if smallest < extent_m / factor < largest)
 

@@ -201,7 +201,7 @@ def refused_note(truth: pd.DataFrame) -> str:
     """One sentence on how many caps gave no truth."""
     refused = truth[truth["status"] != "ok"]
     told = []
-    for reason, rows in sorted(refused.groupby("reason")):
+    for reason, rows in refused.groupby("reason"):  # in the order of their words
         first, more = rows.iloc[0], f" and {len(rows) - 1} more" if len(rows) > 1 else ""
         told.append(f"{reason}: {first['trial']} {first['slot']}{more}")
     listed = f" ({'; '.join(told[:3])}{'; ...' if len(told) > 3 else ''})" if told else ""

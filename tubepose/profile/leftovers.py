@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import pairwise
 
 import cv2
 import numpy as np
@@ -65,27 +64,16 @@ def find_leftovers(
     # Close the gaps of coarse scans, then drop what is thinner than 5 mm: walls' ghosts, slivers beside tops.
     solid = cv2.morphologyEx(picture, cv2.MORPH_CLOSE, np.ones((3, 3), np.uint8))
     solid = cv2.morphologyEx(solid, cv2.MORPH_OPEN, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (5, 5)))
-    count, found_groups = cv2.connectedComponents(solid)
-    groups = np.asarray(found_groups, np.int32)
-    points_of = _by_group(groups[cells[:, 0], cells[:, 1]], count)
-    cells_of = _by_group(groups.ravel(), count)
+    count, groups = cv2.connectedComponents(solid)
+    of = groups[cells[:, 0], cells[:, 1]]
     pitch = float(rack.pitches_m.min())
     found: list[Leftover] = []
-    for points, place in zip(points_of, cells_of, strict=True):
-        if len(points):
-            own = np.column_stack(np.unravel_index(place, groups.shape))
-            entry = _judge(standing, rest[points], own, half, pitch, taken, rack, tubes)
+    for group in range(1, count):
+        rows = rest[of == group]
+        if len(rows):
+            entry = _judge(standing, rows, np.argwhere(groups == group), half, pitch, taken, rack, tubes)
             found += [entry] if entry is not None else []
     return tuple(found)
-
-
-def _by_group(group: NDArray[np.integer], count: int) -> list[NDArray[np.intp]]:
-    """Where each of the groups 1 to count - 1 is, (N,) of (M,), in order."""
-    there = np.flatnonzero(group)
-    own = group[there].astype(np.uint16 if count < 2**16 else np.int32)  # 16 bits are sorted by counting
-    order = np.argsort(own, kind="stable")
-    ends = np.searchsorted(own[order], np.arange(1, count + 1))
-    return [there[order[a:b]] for a, b in pairwise(ends)]
 
 
 def _judge(

@@ -200,11 +200,15 @@ def _scores_in(
     reach = len(_top_kernels(tube)[0]) // 2
     for low, high in zip(*(np.clip(ends[wanted], 0, filled.shape) for ends in windows), strict=True):
         first = np.maximum(low - reach, 0)
-        near = tuple(slice(a, b + reach) for a, b in zip(first, high, strict=True))
-        inner = tuple(slice(a, b) for a, b in zip(low - first, high - first, strict=True))
-        own = tuple(slice(a, b) for a, b in zip(low, high, strict=True))
-        score[own] = _top_score(filled[near], off_m[near], tube, config)[inner]
+        near = _cells(first, high + reach)
+        part = _top_score(filled[near], off_m[near], tube, config)
+        score[_cells(low, high)] = part[_cells(low - first, high - first)]
     return score
+
+
+def _cells(low: NDArray[np.intp], high: NDArray[np.intp]) -> tuple[slice, slice]:
+    """A rectangle of cells, from one corner (2,) to before another."""
+    return slice(low[0], high[0]), slice(low[1], high[1])
 
 
 @lru_cache(maxsize=64)

@@ -11,10 +11,17 @@ from tubepose.rack.kernels import in_frame, numbers
 
 
 @compiled
+def on_plane(right, ahead, up, camera):
+    """Where the line of sight to a place of a frame crosses the frame's plane."""
+    share = up / (up - camera[2])
+    return right + share * (camera[0] - right), ahead + share * (camera[1] - ahead)
+
+
+@compiled
 def labelled(points_m, rotation, origin_m, camera_m, reach_m, window_m, through_m):
     """Points within `window_m` of a frame's plane (N, 3), and where sight to those far below crosses it (M, 2)."""
     frame, reach_x, reach_y = numbers(rotation, origin_m), reach_m[0], reach_m[1]
-    camera_x, camera_y, camera_z = camera_m[0], camera_m[1], camera_m[2]
+    camera = (camera_m[0], camera_m[1], camera_m[2])
     solid, free = np.empty_like(points_m), np.empty((len(points_m), 2))
     solids, frees = 0, 0
     for k in range(len(points_m)):
@@ -22,9 +29,7 @@ def labelled(points_m, rotation, origin_m, camera_m, reach_m, window_m, through_
         if not (abs(up) < window_m or up < -through_m):
             continue
         if up < -through_m:
-            share = up / (up - camera_z)
-            right += share * (camera_x - right)
-            ahead += share * (camera_y - ahead)
+            right, ahead = on_plane(right, ahead, up, camera)
         if abs(right) < reach_x and abs(ahead) < reach_y:
             if up < -through_m:
                 free[frees, 0], free[frees, 1] = right, ahead
@@ -39,13 +44,12 @@ def labelled(points_m, rotation, origin_m, camera_m, reach_m, window_m, through_
 def cells_crossed(points_m, step, rotation, origin_m, camera_m, side_m, shape):
     """Which cells of a rectangle about a frame's origin the lines of sight to every `step`-th point cross."""
     frame, side_x, side_y = numbers(rotation, origin_m), side_m[0], side_m[1]
-    camera_x, camera_y, camera_z = camera_m[0], camera_m[1], camera_m[2]
+    camera = (camera_m[0], camera_m[1], camera_m[2])
     hit = np.zeros((shape[0], shape[1]), np.bool_)
     for k in range(0, len(points_m), step):
         right, ahead, up = in_frame(frame, points_m[k, 0], points_m[k, 1], points_m[k, 2])
-        share = up / (up - camera_z)
-        u = (right + share * (camera_x - right)) / side_x + 0.5
-        v = (ahead + share * (camera_y - ahead)) / side_y + 0.5
+        right, ahead = on_plane(right, ahead, up, camera)
+        u, v = right / side_x + 0.5, ahead / side_y + 0.5
         if 0 <= u < 1 and 0 <= v < 1:
             hit[int(u * shape[0]), int(v * shape[1])] = True
     return hit
@@ -159,9 +163,8 @@ def band_places(points_m, rotation, origin_m, height_m):
 def crossed(points_m, step, rotation, origin_m, camera_m):
     """Where the lines of sight to every `step`-th point (N, 3) cross a frame's plane, shape (M, 2)."""
     frame, at = numbers(rotation, origin_m), np.empty(((len(points_m) + step - 1) // step, 2))
-    camera_x, camera_y, camera_z = camera_m[0], camera_m[1], camera_m[2]
+    camera = (camera_m[0], camera_m[1], camera_m[2])
     for k in range(len(at)):
         right, ahead, up = in_frame(frame, points_m[k * step, 0], points_m[k * step, 1], points_m[k * step, 2])
-        share = up / (up - camera_z)
-        at[k, 0], at[k, 1] = right + share * (camera_x - right), ahead + share * (camera_y - ahead)
+        at[k, 0], at[k, 1] = on_plane(right, ahead, up, camera)
     return at
