@@ -39,11 +39,19 @@ def render(
     side: Annotated[int, typer.Option(min=96, max=2064, help="Longer side of the pictures, pixels.")] = 640,
     variants: Annotated[float, typer.Option(min=0, max=1, help="Share of random variants of the labware.")] = 0.5,
     view: Annotated[
-        Literal["any", "scanner"], typer.Option(help="any: from anywhere. scanner: one rack, from above.")
+        Literal["any", "scanner", "rack"],
+        typer.Option(help="any: from anywhere. scanner: one rack, from above. rack: the same, cut to the rack."),
     ] = "any",
     fill: Annotated[
         str | None, typer.Option(metavar="SHARE", help="Occupied slots: 0.3 or 0.1-0.4; default: empty to full.")
     ] = None,
+    mixed: Annotated[
+        float, typer.Option(min=0, max=1, help="Share of the racks in which hardly two tubes are of one kind.")
+    ] = 0.0,
+    quality: Annotated[
+        Literal["any", "good"],
+        typer.Option(help="any: out of focus and too bright as well. good: a camera that someone has set up."),
+    ] = "any",
     held_out: Annotated[bool, typer.Option("--held-out", help="Grounds that no training picture has.")] = False,
     threads: Annotated[int, typer.Option(min=0, help="0: one per core. They change no picture.")] = 0,
 ) -> None:
@@ -58,8 +66,8 @@ def render(
     shares = read_range("--fill", fill) if fill is not None else None
     if shares is not None and not shares[0] <= shares[1] <= 1.0:
         raise ConfigError(f"--fill {fill}: expected shares of the slots from 0 to 1, the least first")
-    drawn = replace(read_labware_list(labware), variants=variants, held_out=held_out, fill=shares)
-    _render(out, ImageSet(drawn, seed, side, view), count, threads or available_cores())
+    drawn = replace(read_labware_list(labware), variants=variants, held_out=held_out, fill=shares, mixed=mixed)
+    _render(out, ImageSet(drawn, seed, side, view, quality), count, threads or available_cores())
     say(f"{out}: {count} rendered pictures with labels")
 
 
@@ -79,7 +87,8 @@ def train(
     picture_side: Annotated[int, typer.Option(min=96, max=2064, help="Longer side of rendered pictures.")] = 1024,
     variants: Annotated[float, typer.Option(min=0, max=1, help="Share of random variants of the labware.")] = 0.5,
     view: Annotated[
-        Literal["any", "scanner"], typer.Option(help="any: from anywhere. scanner: one rack, from above.")
+        Literal["any", "scanner", "rack"],
+        typer.Option(help="any: from anywhere. scanner: one rack, from above. rack: the same, cut to the rack."),
     ] = "any",
     seed: Annotated[int, typer.Option(min=0, help="Of the pictures and of the training.")] = 0,
     images: Annotated[

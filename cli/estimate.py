@@ -12,6 +12,7 @@ import typer
 from tubepose_cli.paths import named
 
 if TYPE_CHECKING:
+    from tubepose.batch import Job, UnnamedJob
     from tubepose.records import Row
 
 
@@ -70,13 +71,13 @@ def estimate(
 
     Writes racks.csv, slots.csv, estimates.csv, timings.csv, run.json and overlays/ into --out.
     """
-    from tubepose.batch import Job, UnnamedJob
     from tubepose.capture.session import SESSION_FILE, is_session
     from tubepose.config import load_config
     from tubepose.errors import CaptureError, kept
     from tubepose_cli.inputs import (
         capture_jobs,
         make_detector,
+        no_such_file,
         read_methods,
         read_tubes,
         refuse_idle_topics,
@@ -91,6 +92,8 @@ def estimate(
     settings = load_config(config)
     choice = read_rack(rack, pitch, slot)
     tube_models = read_tubes(tubes) if tubes is not None else ()
+    if not any(path.exists() for path in captures):  # before seconds of imports
+        finish([no_such_file(path) for path in captures])
     methods = read_methods(method)
     detector_for = make_detector(detector, model, boxes, classes, layout, settings)
     topics = {"cloud": cloud_topic, "depth": depth_topic, "image": image_topic, "info": info_topic}

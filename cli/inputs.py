@@ -68,6 +68,11 @@ def unknown_name(kind: str, name: str, known: Iterable[str]) -> str:
     return f"unknown {kind} '{name}'{guess}; known: {', '.join(known)}"
 
 
+def no_such_file(path: Path) -> str:
+    """What to say of a path that is not there."""
+    return f"{path}: no such file or folder"
+
+
 def find_sessions(paths: Sequence[Path], *, fail_fast: bool = False) -> tuple[list[Path], list[str]]:
     """Session folders at or below the given paths, and one line per path that has none."""
     from tubepose.capture.session import is_session
@@ -80,7 +85,7 @@ def find_sessions(paths: Sequence[Path], *, fail_fast: bool = False) -> tuple[li
         found = [folder] if is_session(folder) else sessions_below(folder)
         sessions += found
         if not path.exists():
-            problems.append(f"{path}: no such file or folder; expected a session folder")
+            problems.append(f"{no_such_file(path)}; expected a session folder")
         elif not found:
             problems.append(f"{path}: no session.yaml there or one folder below; see docs/capture-format.md")
         if problems and fail_fast:
@@ -132,7 +137,7 @@ def capture_jobs(
             ], problems
         return [replace(job, rack=choice.rack or job.rack, tubes=tubes or job.tubes) for job in known], problems
     if not path.exists():
-        raise CaptureError(f"{path}: no such file or folder")
+        raise CaptureError(no_such_file(path))
     topic = {f"{kind}_topic": name for kind, name in (topics or {}).items()}
     opened = open_captures(path, unit=unit, **topic)
     told = read_hint(hint, choice.rack) if hint is not None else None

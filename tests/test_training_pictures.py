@@ -20,6 +20,7 @@ from tubepose.training.images import CLASSES, ImageSet, write_images
 from tubepose.training.labels import label_objects
 from tubepose.training.render import render
 from tubepose.training.scenes import Labware, LearningScene, SceneObject, random_scene
+from tubepose.training.sensor import expose
 from tubepose.training.textures import GROUNDS, HELD_OUT_GROUNDS, SIZE
 from tubepose.training.variants import cap_outline, fits, vary_rack, vary_tube
 from tubepose.transforms import make_transform
@@ -158,6 +159,37 @@ def test_a_scanner_sees_all_of_one_rack_from_above():
         assert pixels.max() < 159
 
 
+def test_a_view_of_a_rack_is_the_scanners_cut_to_what_is_on_the_rack():
+    for seed in range(6):
+        far, near = (
+            random_scene(labware(variants=1.0), 160, np.random.default_rng(seed), view) for view in ("scanner", "rack")
+        )
+        shape = np.vstack([found.shape_m for found in near.objects])
+        pixels = near.intrinsics.project(shape)
+        assert pixels.min() > -0.5
+        assert pixels.max() < 159.5
+        assert np.ptp(pixels, axis=0).max() > 160 / 1.51
+        np.testing.assert_allclose(shape, np.vstack([found.shape_m for found in far.objects]))
+        # One picture is a scaled part of the other.
+        one, other = near.intrinsics, far.intrinsics
+        np.testing.assert_allclose((pixels - [one.cx, one.cy]) / one.fx, (other.project(shape) - 79.5) / other.fx)
+
+
+def test_mixed_racks_hold_many_kinds_of_tubes_and_others_three_at_most():
+    def kinds(mixed):
+        drawn = labware(variants=1.0, fill=(1.0, 1.0), mixed=mixed)
+        scenes = [random_scene(drawn, 96, np.random.default_rng(seed), "scanner") for seed in range(6)]
+        return [
+            len({part.surface.albedo for part in scene.parts if part.owner > 0 and part.surface.sharpness >= 40})
+            for scene in scenes
+        ]
+
+    few, many = kinds(0.0), kinds(1.0)
+    assert np.mean(many) > 2 * np.mean(few)
+    assert ImageSet(labware(mixed=0.5)).recipe()["mixed"] == 0.5
+    assert "mixed" not in ImageSet(labware()).recipe()
+
+
 def test_a_given_fill_is_kept():
     for seed in range(4):
         scene = random_scene(labware(variants=0.0, fill=(0.1, 0.2)), 96, np.random.default_rng(seed), "scanner")
@@ -193,6 +225,26 @@ def test_labels_on_disk_are_those_of_the_scene(tmp_path):
         ids, edges = files.read_boxes(number, (picture.shape[1], picture.shape[0]))
         assert [CLASSES[k] for k in ids] == [label.class_name for label in labels]
         assert edges == pytest.approx(np.array([label.box_xyxy_px for label in labels]).reshape(-1, 4), abs=1e-6)
+
+
+def test_a_camera_that_is_set_up_is_in_focus_and_hardly_too_bright():
+    ramp = np.tile(np.linspace(0, 1, 256, dtype=np.float32), (64, 1))
+    ramp[:, 100:] += 0.2
+    radiance = np.repeat(ramp[..., None], 3, axis=2)
+
+    def look(quality):
+        pictures = [expose(radiance, "projector", np.random.default_rng(seed), quality) for seed in range(60)]
+        shown = np.stack(pictures)[..., 0].astype(float)
+        rows = shown.mean(axis=1)
+        edge = (rows[:, 102] - rows[:, 97]) / (rows[:, 106] - rows[:, 93])
+        return (shown == 255).mean(axis=(1, 2)), edge
+
+    (bright, sharp), (any_bright, any_sharp) = look("good"), look("any")
+    assert bright.max() < 0.05
+    assert any_bright.max() > 0.15
+    assert sharp.min() > any_sharp.min() + 0.1
+    assert ImageSet(labware(), quality="good").recipe()["quality"] == "good"
+    assert "quality" not in ImageSet(labware()).recipe()
 
 
 def test_a_folder_of_another_recipe_or_of_something_else_is_refused(tmp_path):

@@ -29,7 +29,7 @@ from tubepose.simulation.parallel import in_processes
 from tubepose.training.labels import Label, label_objects
 from tubepose.training.render import render
 from tubepose.training.scenes import Labware, View, random_scene
-from tubepose.training.sensor import expose
+from tubepose.training.sensor import Quality, expose
 
 CLASSES = (RACK_CLASS, CAPPED_CLASS, OPEN_CLASS)
 """Class names in the order of their numbers."""
@@ -48,19 +48,21 @@ class ImageSet:
         seed: Sets of different seeds have no picture in common.
         long_side_px: Longer side of the pictures.
         view: From where the camera looks, as `random_scene` says.
+        quality: How well the camera is set up, as `expose` says; scenes are the same.
     """
 
     labware: Labware
     seed: int = 0
     long_side_px: int = LONG_SIDE_PX
     view: View = "any"
+    quality: Quality = "any"
 
     def picture(self, number: int) -> tuple[NDArray[np.uint8], list[Label]]:
         """Picture k, 8-bit RGB of shape (H, W, 3), and its labels."""
         scene_rng, light_rng, sensor_rng = np.random.default_rng([self.seed, number]).spawn(3)
         scene = random_scene(self.labware, self.long_side_px, scene_rng, self.view)
         rendered = render(scene.parts, scene.light, scene.intrinsics, light_rng)
-        return expose(rendered.radiance, scene.sensor, sensor_rng), label_objects(scene, rendered)
+        return expose(rendered.radiance, scene.sensor, sensor_rng, self.quality), label_objects(scene, rendered)
 
     def recipe(self) -> dict[str, Any]:
         """What tells this set from others, as `set.yaml` says it."""
@@ -75,6 +77,8 @@ class ImageSet:
             "held_out_grounds": self.labware.held_out,
             "simulated": True,
             **({"fill": list(self.labware.fill)} if self.labware.fill is not None else {}),
+            **({"mixed": self.labware.mixed} if self.labware.mixed > 0 else {}),
+            **({"quality": self.quality} if self.quality != "any" else {}),
         }
 
 

@@ -23,12 +23,15 @@ from tubepose.training.viewpoints import (
     SENSORS,
     Sensor,
     any_camera,
+    cut_to,
     random_light,
     scanner_camera,
 )
 from tubepose.transforms import FloatArray, invert_transform, make_transform, transform_points
 
-View = Literal["any", "scanner"]
+View = Literal["any", "scanner", "rack"]
+_KINDS, _KINDS_MIXED = (1, 4), (8, 20)
+"""Kinds of tubes that a rack may hold, from the first number to below the second."""
 STANDS_OUT_M = 1e-3
 """The box of a tube in a rack is for what stands out of the rack by more than this."""
 
@@ -80,6 +83,7 @@ class Labware:
         variants: Share of the racks and tubes that are random variants of the given ones.
         held_out: Put them on grounds that no picture to train on has, to judge by.
         fill: Least and most share of a rack's slots that are tried to fill; None for anything from empty to full.
+        mixed: Share of the racks in which hardly two tubes are of one kind; the others hold one to three kinds.
     """
 
     racks: tuple[RackModel, ...]
@@ -88,6 +92,7 @@ class Labware:
     variants: float = 0.5
     held_out: bool = False
     fill: tuple[float, float] | None = None
+    mixed: float = 0.0
 
 
 class _Builder:
@@ -135,7 +140,8 @@ class _Builder:
     def _tubes_for(self, rack: RackModel) -> list[tuple[TubeModel, objects.TubeLook]]:
         rng, found = self.rng, []
         near = matching_tubes(rack, self.labware.tubes)
-        for _ in range(int(rng.integers(1, 4))):
+        mixed = self.labware.mixed > 0 and rng.uniform() < self.labware.mixed
+        for _ in range(int(rng.integers(*(_KINDS_MIXED if mixed else _KINDS)))):
             pool = near if near and rng.uniform() < 0.8 else list(self.labware.tubes)
             tube = pool[int(rng.integers(len(pool)))]
             if rng.uniform() < self.labware.variants:
@@ -230,15 +236,19 @@ def random_scene(labware: Labware, long_side_px: int, rng: np.random.Generator, 
         rng: Source of randomness.
         view: ``any``: up to four racks, free tubes and clutter, from anywhere. ``scanner``: how a fixed scanner looks
             at the one rack that a robot works at: all of it in view, from above, tilted by 20 degrees at most.
+            ``rack``: of such a view what lies around the rack, as a detector sees it that looks at a rack alone.
     """
     sensor: Sensor = SENSORS[int(rng.choice(3, p=SENSOR_CHANCE))]
     builder = _Builder(labware, rng)
-    if view == "scanner":
+    if view != "any":
         while not builder.objects:
             builder.add_rack(0.0)
         for _ in range(int(rng.integers(0, 4))):
             builder.add_clutter(0.3)
         intrinsics, T_camera_table = scanner_camera(builder.objects[0][1], long_side_px, rng)
+        if view == "rack":
+            shapes = np.vstack([points for _, points, _, _ in builder.objects])
+            intrinsics = cut_to(intrinsics, transform_points(T_camera_table, shapes), rng)
         builder.add(np.eye(4), _table(labware, rng))
         return _in_camera(builder, sensor, intrinsics, T_camera_table, random_light(sensor, T_camera_table, rng))
     racks = int(rng.choice([0, 1, 2, 3, 4], p=[0.04, 0.46, 0.25, 0.15, 0.10]))

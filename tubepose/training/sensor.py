@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Literal
+
 import cv2
 import numpy as np
 from numpy.typing import NDArray
@@ -9,22 +11,28 @@ from numpy.typing import NDArray
 from tubepose.training.viewpoints import Sensor
 
 Float32Array = NDArray[np.float32]
+Quality = Literal["any", "good"]
 
 
-def expose(radiance: Float32Array, sensor: Sensor, rng: np.random.Generator) -> NDArray[np.uint8]:
+def expose(
+    radiance: Float32Array, sensor: Sensor, rng: np.random.Generator, quality: Quality = "any"
+) -> NDArray[np.uint8]:
     """An 8-bit RGB picture (H, W, 3) of linear light; gray for the gray sensors.
 
     Args:
         radiance: Linear light, shape (H, W, 3).
         sensor: Kind of picture.
         rng: Source of randomness.
+        quality: ``good`` is a camera that someone has set up: in focus, not moved, and next to nothing too bright.
+            ``any`` has everything else as well.
     """
+    good = quality == "good"
     light = radiance
     if sensor != "color":
         light = np.repeat(radiance.mean(axis=2, keepdims=True), 3, axis=2)
-    light = _lens(light, rng)
-    level = float(np.percentile(light, rng.uniform(80, 99.7)))
-    light = light * np.float32(rng.uniform(0.4, 1.1) / max(level, 1e-4))
+    light = _lens(light, rng, good)
+    level = float(np.percentile(light, rng.uniform(*((99.0, 99.7) if good else (80, 99.7)))))
+    light = light * np.float32(rng.uniform(*((0.7, 1.0) if good else (0.4, 1.1))) / max(level, 1e-4))
     if sensor == "color":
         light = light * rng.uniform(0.85, 1.15, 3).astype(np.float32)
     light = _noisy(light, sensor, rng)
@@ -41,11 +49,11 @@ def expose(radiance: Float32Array, sensor: Sensor, rng: np.random.Generator) -> 
     return data
 
 
-def _lens(light: Float32Array, rng: np.random.Generator) -> Float32Array:
-    """Blur of focus or motion, and darker corners."""
-    sigma = float(rng.uniform(0.35, 0.8)) if rng.uniform() < 0.75 else float(rng.uniform(0.8, 2.0))
+def _lens(light: Float32Array, rng: np.random.Generator, sharp: bool) -> Float32Array:
+    """Blur of focus or motion, unless it is sharp, and darker corners."""
+    sigma = float(rng.uniform(0.35, 0.8)) if rng.uniform() < 0.75 or sharp else float(rng.uniform(0.8, 2.0))
     light = np.asarray(cv2.GaussianBlur(light, (0, 0), sigma), np.float32)
-    if rng.uniform() < 0.08:
+    if rng.uniform() < 0.08 and not sharp:
         length, angle = int(rng.integers(3, 8)), rng.uniform(0, np.pi)
         kernel = np.zeros((2 * length + 1, 2 * length + 1), np.float32)
         reach = (length * np.array([np.cos(angle), np.sin(angle)])).astype(int)
