@@ -92,20 +92,24 @@ def test_a_hint_halfway_between_the_turns_decides_nothing(soft_scan):
     assert (pose.ambiguous, pose.resolved_by) == (True, "rule")
 
 
-def test_a_hint_far_from_both_places_decides_nothing(soft_scan):
+@pytest.mark.parametrize("yaw_deg", [10, 190])
+def test_a_hint_far_from_both_places_decides_nothing_and_the_note_says_which_turn_is_given(yaw_deg):
+    scan = transform_points(scenes.camera_from_rack(SOFT, np.deg2rad(yaw_deg)), scenes.rack_top(SOFT))
     for pixel in ((-5000.0, 300.0), (9000.0, 9000.0)):
-        pose = register_rack(soft_scan, SOFT, CONFIG, SlotHint(slot="A1", pixel=pixel), scenes.CAMERA)
+        pose = register_rack(scan, SOFT, CONFIG, SlotHint(slot="A1", pixel=pixel), scenes.CAMERA)
         assert (pose.ambiguous, pose.resolved_by) == (True, "rule")
         said = re.fullmatch(
-            rf"the hint says that A1 is seen at {pixel[0]:.0f},{pixel[1]:.0f}, but it is at (-?\d+),(-?\d+) or, "
-            r"the rack turned, at (-?\d+),(-?\d+): point nearer to one of them, in pixels of the capture's image .*",
+            rf"the hint says that A1 is seen at {pixel[0]:.0f},{pixel[1]:.0f}, but it is at (-?\d+),(-?\d+) in the "
+            r"pose given or, the rack turned, at (-?\d+),(-?\d+): point nearer to one of them, .*",
             pose.hint_note,
         )
         assert said
-        # Whoever points where it says is understood.
-        told = SlotHint(slot="A1", pixel=(float(said[3]), float(said[4])))
-        again = register_rack(soft_scan, SOFT, CONFIG, told, scenes.CAMERA)
-        assert (again.resolved_by, again.hint_note) == ("hint", "")
+        # Whoever points where it says is understood, and the first place is that of the pose given.
+        for place, turn in ((said.group(1, 2), np.eye(4)), (said.group(3, 4), HALF_TURN)):
+            told = SlotHint(slot="A1", pixel=(float(place[0]), float(place[1])))
+            again = register_rack(scan, SOFT, CONFIG, told, scenes.CAMERA)
+            assert (again.resolved_by, again.hint_note) == ("hint", "")
+            assert_same_pose(again.T_camera_rack, pose.T_camera_rack @ turn)
 
 
 def test_a_hint_without_intrinsics_is_not_used(soft_scan):

@@ -212,20 +212,20 @@ def _pose(
     margin_m = turned.agreement.rmse_m - best.agreement.rmse_m
     index, resolved_by = choose_turn(best.fit.T_camera_rack, T_turned, margin_m, rack, config.rack, hint, intrinsics)
     chosen, reason = (best, turned)[index], best.reason
+    turns = (best.fit.T_camera_rack, T_turned)
+    T_given, T_other = turns[index], turns[1 - index]
     seen = chosen.agreement
     return RackPose(
         RackStatus.REFUSED if reason else RackStatus.OK,
         reason,
-        None if reason else (best.fit.T_camera_rack, T_turned)[index],
+        None if reason else T_given,
         seen.rmse_m,
         seen.fitness,
         seen.in_slot,
         seen.coverage,
         ambiguous=resolved_by == "rule" and not reason,
         resolved_by="" if reason else resolved_by,
-        hint_note=unused_hint(best.fit.T_camera_rack, T_turned, rack, hint, intrinsics)
-        if resolved_by == "rule" and not reason
-        else "",
+        hint_note=unused_hint(T_given, T_other, rack, hint, intrinsics) if resolved_by == "rule" and not reason else "",
         turn_margin_m=margin_m if index == 0 else -margin_m,
         spacing_m=seen.spacing_m,
         level_tops=0 if reason or chosen.fit.level is None else chosen.fit.level.count,

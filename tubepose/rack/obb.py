@@ -69,7 +69,8 @@ def register_obb_icp(
     index, resolved_by = choose_turn(
         best.T_camera_rack, turned.T_camera_rack, margin_m, rack, config.rack, hint, intrinsics
     )
-    chosen = (best, turned)[index]
+    turns = (best, turned)
+    chosen, other = turns[index], turns[1 - index]
     template_m = rack_template_m(rack, config.rack.template_spacing_m)
     in_slot, coverage = agreement(scan, chosen.T_camera_rack, template_m, rack, config.rack)
     reason = refusal(chosen.fitness, chosen.inlier_rmse_m, in_slot, coverage, rack, config.rack)
@@ -83,7 +84,7 @@ def register_obb_icp(
         coverage,
         ambiguous=resolved_by == "rule" and not reason,
         resolved_by="" if reason else resolved_by,
-        hint_note=unused_hint(best.T_camera_rack, turned.T_camera_rack, rack, hint, intrinsics)
+        hint_note=unused_hint(chosen.T_camera_rack, other.T_camera_rack, rack, hint, intrinsics)
         if resolved_by == "rule" and not reason
         else "",
         turn_margin_m=margin_m if chosen is best else -margin_m,

@@ -106,22 +106,22 @@ def choose_turn(
 
 
 def unused_hint(
-    T_camera_best: FloatArray,
-    T_camera_turned: FloatArray,
+    T_camera_given: FloatArray,
+    T_camera_other: FloatArray,
     rack: RackModel,
     hint: SlotHint | None,
     intrinsics: CameraIntrinsics | None,
 ) -> str:
-    """Why a hint has not decided between two turns, in words; empty without a hint."""
+    """Why a hint has not decided between the turn that is given and the other one, in words; empty without a hint."""
     if hint is None:
         return ""
     if intrinsics is None:
         return f"the hint for {hint.slot} is a pixel, and this cloud has none: give an organised cloud or an image"
-    (u, v), (other_u, other_v) = _hinted(T_camera_best, T_camera_turned, rack, hint, intrinsics)
+    (u, v), (other_u, other_v) = _hinted(T_camera_given, T_camera_other, rack, hint, intrinsics)
     return (
         f"the hint says that {hint.slot} is seen at {hint.pixel[0]:.0f},{hint.pixel[1]:.0f}, but it is at "
-        f"{u:.0f},{v:.0f} or, the rack turned, at {other_u:.0f},{other_v:.0f}: point nearer to one of them, in "
-        "pixels of the capture's image (an overlay is cut and scaled)"
+        f"{u:.0f},{v:.0f} in the pose given or, the rack turned, at {other_u:.0f},{other_v:.0f}: point nearer to one "
+        "of them, in pixels of the capture's image (an overlay is cut and scaled)"
     )
 
 
