@@ -126,7 +126,7 @@ def capture_jobs(
         idle = [option for option, value in given.items() if value is not None]
         if idle:
             raise ConfigError(
-                f"{path}: {', '.join(idle)} given, but a session says that itself, trial by trial; "
+                f"{path}: {', '.join(idle)} given, but a session says that itself: unit, topics, and a trial's hint; "
                 "leave it out, or give the captures one by one"
             )
         known, problems = session_jobs(load_session(path), fail_fast=fail_fast)

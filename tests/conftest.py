@@ -7,6 +7,7 @@ timed, as machines differ. `pytest --hypothesis-profile search` tries new ones.
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import pytest
 from commands import tubepose
@@ -15,6 +16,28 @@ from hypothesis import settings
 settings.register_profile("same", deadline=None, derandomize=True)
 settings.register_profile("search", deadline=None)
 settings.load_profile("same")
+
+LIGHT = ("test_structured_light.py", "test_simulation_sessions.py", "test_cli.py", "test_truth_tables.py")
+"""Files that follow light through plastic, whose loops take a minute to compile; the first begins with those."""
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """The files of `LIGHT` before all others, in that order."""
+    items.sort(key=lambda item: LIGHT.index(item.path.name) if item.path.name in LIGHT else len(LIGHT))
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
+    """One process runs all of `LIGHT`; it compiles what follows light, another what fits poses, and both use both."""
+    from xdist.scheduler import LoadFileScheduling
+
+    class LightTogether(LoadFileScheduling):  # type: ignore[misc]
+        def _split_scope(self, nodeid: str) -> str:
+            file = super()._split_scope(nodeid)
+            return "light" if Path(file).name in LIGHT else file
+
+    return LightTogether(config, log)
+
 
 SMALL_RACK = "round-10ml-3x4"
 SMALL_TUBES = ("blood-16x100", "chen2023-tube-3")

@@ -53,7 +53,7 @@ ALLOWED: dict[str, set[str]] = {
     "records": {"capture", "pipeline", "pose_errors", "rack", "slots"},
     "batch": {"capture", "compiled", "config", "labware", "detection", "rack", "pipeline", "records"},
     "ground_truth": {"capture", "labware"},
-    "simulation": {"capture", "labware"},
+    "simulation": {"capture", "compiled", "labware"},
     "statistics": set(),
     "pose_errors": set(),
     "evaluation": {"labware", "pose_errors", "statistics"},

@@ -10,6 +10,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+import yaml
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from mcap.records import Message
@@ -17,11 +18,13 @@ from mcap.stream_reader import StreamReader
 from mcap.writer import Writer as RawWriter
 from mcap_ros2.writer import Writer
 
+from tubepose.batch import trial_capture
 from tubepose.capture import CameraIntrinsics, RgbdFrame, open_captures, write_mcap
 from tubepose.capture import mcap_writing as writing
 from tubepose.capture.compressed_depth import FORMAT, decode_compressed_depth, encode_compressed_depth
 from tubepose.capture.message_types import CAMERA_INFO, COMPRESSED_IMAGE, DEFINITIONS, IMAGE, POINT_CLOUD
 from tubepose.capture.ros import camera_of, cloud_arrays, image_array
+from tubepose.capture.session import load_session
 from tubepose.errors import CaptureError
 
 STAMP_NS = 1_700_000_000_123_456_789
@@ -520,6 +523,27 @@ def test_several_topics_are_listed_as_options_to_paste(tmp_path):
     np.testing.assert_allclose(frame.cloud_m, cloud * 2, atol=1e-6)
     with pytest.raises(CaptureError, match="no topic /up that can be the cloud topic; found /left/points, /right"):
         read_all(path, cloud_topic="/up")
+
+
+def test_a_session_names_the_unit_and_the_topics_of_its_captures(tmp_path):
+    cloud = make_frame().cloud_m
+    messages = [
+        ("/left/points", POINT_CLOUD, cloud_message(cloud)),
+        ("/right/points", POINT_CLOUD, cloud_message(cloud * 2000)),
+    ]
+    record(tmp_path / "a.mcap", messages)
+    keys = {
+        "format": 1, "name": "monday", "origin": "recorded", "rack": "chen2023-soft-5x10", "unit": "mm",
+        "topics": {"cloud": "/right/points"}, "trials": [{"name": "one", "tubes": {}, "original": "a.mcap"}],
+    }  # fmt: skip
+    (tmp_path / "session.yaml").write_text(yaml.safe_dump(keys))
+    session = load_session(tmp_path)
+    (frame,) = trial_capture(session, session.trials[0], "a.mcap").frames()
+    np.testing.assert_allclose(frame.cloud_m, cloud * 2, rtol=1e-6)
+    for wrong, found in (({"unit": "cm"}, "unit"), ({"topics": {"clouds": "/x"}}, "topics.clouds")):
+        (tmp_path / "session.yaml").write_text(yaml.safe_dump(keys | wrong))
+        with pytest.raises(CaptureError, match=found):
+            load_session(tmp_path)
 
 
 def test_named_topics_go_before_guessed_ones(tmp_path):

@@ -10,7 +10,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tubepose.compiled import mean_square, median, put_in_order, solved
+from tubepose import compiled as compiling
+from tubepose.compiled import SOURCES, compiler, mean_square, median, put_in_order, solved
 
 NUMBERS = st.lists(st.floats(-1e6, 1e6, width=32), min_size=1, max_size=60)
 COMPILES = (
@@ -62,3 +63,44 @@ def test_who_waits_for_the_compiler_is_told_once_and_once_on_a_machine(tmp_path:
 
     assert words() == ["told", "sorted"]
     assert words() == ["sorted"]
+
+
+CALLER = "from kernels import kernel\nfrom callee import one\n\n@kernel\ndef g():\n    return one() + 1\n\nprint(g())\n"
+KERNEL = (
+    "from pathlib import Path\nfrom tubepose.compiled import compiler\n"
+    "kernel = compiler(Path(__file__).parent.glob('call*.py'))\n"
+)
+CALLEE = "from kernels import kernel\n\n@kernel\ndef one():\n    return {}\n"
+
+
+def test_code_of_a_kernel_that_calls_another_one_is_new_when_that_one_changes(tmp_path: Path) -> None:
+    (tmp_path / "caller.py").write_text(CALLER)
+    (tmp_path / "kernels.py").write_text(KERNEL)
+
+    def run() -> str:
+        command, kept = [sys.executable, "-B", "caller.py"], {"NUMBA_CACHE_DIR": str(tmp_path / "kept")}
+        ended = subprocess.run(command, cwd=tmp_path, env=os.environ | kept, capture_output=True, text=True, check=True)
+        return ended.stdout.strip()
+
+    for value in (1, 1000):
+        (tmp_path / "callee.py").write_text(CALLEE.format(value))
+        assert run() == str(value + 1)
+    assert len(list((tmp_path / "kept").iterdir())) == 3  # before, after, and those of the package
+
+
+def test_where_nothing_can_be_written_code_is_compiled_and_not_kept(monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(*_args: object, **_options: object) -> None:
+        raise PermissionError(13, "read-only")
+
+    monkeypatch.setattr(Path, "mkdir", refuse)
+    monkeypatch.setattr(compiling.Path, "expanduser", lambda _: (_ for _ in ()).throw(RuntimeError("no home")))
+    double = compiler(SOURCES)(lambda x: 2 * x)
+    assert double(3) == 6
+    assert not double.stats.cache_path
+
+
+def test_every_file_that_is_compiled_is_among_those_whose_change_is_seen() -> None:
+    library = Path(compiling.__file__).parent
+    users = {path for path in library.rglob("*.py") if "import compiled" in path.read_text()}
+    assert users
+    assert users <= {*SOURCES}

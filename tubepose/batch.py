@@ -135,7 +135,8 @@ def trial_capture(session: Session, trial: Trial, relative: str) -> Capture:
     Raises:
         CaptureError: It is not there, or it is a folder of several.
     """
-    found = open_captures(session.folder / relative)
+    topics = {f"{kind}_topic": name for kind, name in session.topics.model_dump().items()}
+    found = open_captures(session.folder / relative, unit=session.unit, **topics)
     if len(found) != 1:
         raise CaptureError(f"{session.folder / relative}: trial {trial.name} needs one capture, found {len(found)}")
     return found[0]

@@ -6,15 +6,76 @@ that time.
 
 from __future__ import annotations
 
+import hashlib
 import math
-from collections.abc import Callable
+import os
+import tempfile
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import suppress
+from pathlib import Path
 from typing import Any
 
 from numba import njit
+from numba.core import config
 from numba.core import event as events
 
-compiled = njit(cache=True, error_model="numpy")
-"""The machine code is kept; a division by zero is infinity, as in NumPy."""
+_HERE = Path(__file__).parent
+_FOLDER = "CACHE_DIR"
+
+
+def compiler(sources: Iterable[Path], **options: Any) -> Callable[..., Any]:
+    """A decorator that has Numba compile a function when it is first called; more options may be given to it.
+
+    The machine code is kept between runs for as long as none of the sources changes: Numba itself does not see when a
+    kernel changes that another one calls. Where no folder can be written, it is compiled in each run.
+
+    Args:
+        sources: All files of kernels that call each other.
+        options: Of `numba.njit`.
+    """
+    folder = _machine_code(sources)
+
+    def compile_(function: Callable[..., Any], **more: Any) -> Any:
+        kept = getattr(config, _FOLDER)
+        # Numba asks for the folder when a function is decorated.
+        setattr(config, _FOLDER, kept if folder is None else str(folder))
+        try:
+            return njit(**options, **more, cache=folder is not None)(function)
+        finally:
+            setattr(config, _FOLDER, kept)
+
+    return compile_
+
+
+def _machine_code(sources: Iterable[Path]) -> Path | None:
+    """Where the machine code of sources is kept; None if nothing can be written."""
+    content = hashlib.sha256()
+    for path in sorted(sources):
+        content.update(path.read_bytes())
+    for base in _bases():
+        folder = base / f"kernels-{content.hexdigest()[:16]}"
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            tempfile.TemporaryFile(dir=folder).close()
+        except OSError:
+            continue
+        return folder
+    return None
+
+
+def _bases() -> Iterator[Path]:
+    """NUMBA_CACHE_DIR, beside the sources, the user's cache."""
+    if asked := getattr(config, _FOLDER):
+        yield Path(asked)
+    yield _HERE / "__pycache__"
+    with suppress(RuntimeError):  # a user without a home
+        yield Path(os.environ.get("XDG_CACHE_HOME") or Path("~/.cache").expanduser()) / "tubepose"
+
+
+SOURCES = (Path(__file__), *_HERE.glob("profile/*kernels.py"), *_HERE.glob("rack/*kernels.py"))
+"""The files of all loops over points."""
+compiled = compiler(SOURCES, error_model="numpy")
+"""For the loops over points; a division by zero is infinity, as in NumPy."""
 
 
 class _Compilations(events.Listener):

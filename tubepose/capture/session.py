@@ -10,6 +10,7 @@ from typing import Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
+from tubepose.capture.description import Unit
 from tubepose.errors import CaptureError, LabwareError
 from tubepose.labware import CapModel, RackModel, TubeModel, load_cap, load_rack, load_tube, unique_tubes
 from tubepose.labware.reading import read_yaml, validate
@@ -49,12 +50,24 @@ class Trial(BaseModel):
     hint: SlotHint | None = None
 
 
+class Topics(BaseModel):
+    """Topics of the recordings, where several would fit."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+    cloud: str | None = None
+    depth: str | None = None
+    image: str | None = None
+    info: str | None = None
+
+
 class _SessionFile(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
     format: Literal[1]
     name: str = Field(min_length=1)
     origin: Literal["recorded", "simulated"]
     sensor: str = "unknown"
+    unit: Unit | None = None
+    topics: Topics = Topics()
     rack: str
     printed_cap: str | None = None
     trials: tuple[Trial, ...] = Field(min_length=1)
@@ -65,6 +78,8 @@ class Session(BaseModel):
 
     Attributes:
         folder: Where `session.yaml` lies.
+        unit: Of the clouds' coordinates, as `open_captures` takes it.
+        topics: Of the recordings.
         rack: The rack of every trial.
         printed_cap: The printed cap, or None where no trial has one.
         tubes: Every tube model that the trials name, by the name that they use.
@@ -75,6 +90,8 @@ class Session(BaseModel):
     name: str
     origin: Literal["recorded", "simulated"]
     sensor: str
+    unit: Unit | None = None
+    topics: Topics = Topics()
     rack: RackModel
     printed_cap: CapModel | None
     tubes: dict[str, TubeModel]
@@ -120,6 +137,8 @@ def load_session(path: Path) -> Session:
         name=data.name,
         origin=data.origin,
         sensor=data.sensor,
+        unit=data.unit,
+        topics=data.topics,
         rack=rack,
         printed_cap=cap,
         tubes=tubes,

@@ -10,7 +10,7 @@ from tubepose.labware import RackModel
 from tubepose.rack import view_kernels as view_kernels
 from tubepose.rack.field import top_field
 from tubepose.rack.fit import Labels, RoughFit, at_the_top
-from tubepose.rack.rounds import EDGE_SHIFT_M, WRONG_SHARE
+from tubepose.rack.fit_kernels import EDGE_SHIFT_M, WRONG_SHARE
 from tubepose.transforms import FloatArray
 
 # Blur of an edge in what counts as evidence: it must forgive a pixel.

@@ -1,6 +1,6 @@
 """The rack's pose in six degrees of freedom, from its plane and from the edges of its ribs, openings and outline.
 
-What one round of it does is in `rounds`. Points below the top are not used here: next to an edge they mix two depths,
+What one round of it does is in `fit_kernels`. Points below the top are not used here: next to an edge they mix two depths,
 and lie on the side that the projector's shadow leaves. `Labels` has them as evidence all the same.
 """
 
@@ -12,11 +12,11 @@ import cv2
 import numpy as np
 
 from tubepose.labware import RackModel
+from tubepose.rack import fit_kernels
 from tubepose.rack import kernels as kernels
-from tubepose.rack import rounds as rounds
 from tubepose.rack import view_kernels as view_kernels
 from tubepose.rack.field import TopField, top_field
-from tubepose.rack.rounds import INSIDE_M, WIDEST_M
+from tubepose.rack.fit_kernels import INSIDE_M, WIDEST_M
 from tubepose.rack.tops import Level
 from tubepose.transforms import FloatArray, make_transform, parts, translation
 
@@ -193,7 +193,7 @@ def _step(
     T = state.T_camera_top
     window_m = max(EDGE_WINDOW_M, min(3 * state.scatter_m, float(widths_m[0])))
     held = state.level is not None
-    (plane, scatter_m, normal, scores), inside, (edges, outlines), stray = rounds.round_step(
+    (plane, scatter_m, normal, scores), inside, (edges, outlines), stray = fit_kernels.round_step(
         points_m, *parts(T), window_m, blur_m, widths_m, held, *field.grid
     )
     state.covariance = UNKNOWN * np.eye(6)
@@ -209,7 +209,7 @@ def _step(
 
 def _stretch(state: RoughFit, field: TopField) -> tuple[FloatArray, FloatArray]:
     """Stretch along x and y with which the template agrees best, and its standard deviations."""
-    moved, edges = rounds.stretched(at_the_top(state, state.rough_m), *field.grid)
+    moved, edges = fit_kernels.stretched(at_the_top(state, state.rough_m), *field.grid)
     if len(edges[1]) < LEAST_POINTS:
         return np.zeros(2), np.full(2, np.inf)
     return np.asarray(moved[3:]), np.sqrt(np.diag(_clustered(*edges)))[3:]
@@ -219,7 +219,7 @@ def _clustered(normal: FloatArray, scores: FloatArray, points_m: FloatArray) -> 
     """Covariance of a fit whose residuals are alike within squares of `CLUSTER_M`, and independent between them."""
     if len(points_m) == 0:
         return UNKNOWN * np.eye(len(normal))
-    products, count = rounds.cluster_sums(points_m, scores, CLUSTER_M)
+    products, count = fit_kernels.cluster_sums(points_m, scores, CLUSTER_M)
     inverse = np.linalg.inv(normal)
     return np.asarray(inverse @ products @ inverse * (count / max(count - len(normal), 1)))
 
