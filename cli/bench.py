@@ -19,11 +19,6 @@ if TYPE_CHECKING:
     from tubepose.config import Config
     from tubepose_cli.truth import MeasuredTruth
 
-JUDGED_FILES = (
-    "errors.csv", "summary.csv", "comparison.csv", "uncertainty.csv", "coverage.csv", "confusion.csv", "seeds.csv",
-    "slot_accuracy.csv", *(f"table_{kind}.{form}" for kind in ("accuracy", "timing") for form in ("csv", "md", "tex")),
-)  # fmt: skip
-"""What only a run with truth writes: of an earlier one nothing stays beside other estimates."""
 ALL_METHODS = "upright,profile,paper,slot-icp,global-icp"
 
 
@@ -67,7 +62,6 @@ def bench(
     from tubepose.batch import session_jobs
     from tubepose.config import load_config
     from tubepose.errors import kept
-    from tubepose.report.writing import remove_files
     from tubepose.truth_tables import with_exact_rack
     from tubepose_cli.inputs import find_sessions, make_detector, read_methods, sample_session, used_model
     from tubepose_cli.results import run_estimates
@@ -102,10 +96,8 @@ def bench(
     )  # fmt: skip
     if len(measured.truth):
         _report(tables, measured, jobs, names, settings, out, seeds, published)
-    else:
-        remove_files(out, JUDGED_FILES)
-        if not exact_truth:
-            say("no trial has a capture with printed caps that could be measured: no errors, no tables")
+    elif not exact_truth:
+        say("no trial has a capture with printed caps that could be measured: no errors, no tables")
     finish([*problems, *tables.problems])
 
 

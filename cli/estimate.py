@@ -12,7 +12,7 @@ import typer
 from tubepose_cli.paths import named
 
 if TYPE_CHECKING:
-    from tubepose.batch import Job, UnnamedJob
+    from tubepose.batch import Job, Tables, UnnamedJob
     from tubepose.records import Row
 
 
@@ -87,7 +87,7 @@ def estimate(
     )
     from tubepose_cli.racks import read_rack
     from tubepose_cli.results import run_estimates
-    from tubepose_cli.show import describe_tubes, finish, say
+    from tubepose_cli.show import finish, say
 
     settings = load_config(config)
     choice = read_rack(rack, pitch, slot)
@@ -121,35 +121,50 @@ def estimate(
         ],
         problems=problems, detector=detector,
     )  # fmt: skip
-    with_rack = {_capture_of(row) for row in tables.racks if row["rack"]}
-    for row in tables.racks:
-        if not row["rack"]:
-            if _capture_of(row) in with_rack:  # else its reason is among the problems
-                say(f"{row['capture']} frame {row['frame']}: {row['status']}: {row['reason']}")
-            continue
-        settle = row["hint_note"] or "--hint SLOT@U,V settles it"
-        turn = f", turn ambiguous by 180 degrees (slot names may be swapped; {settle})" if row["ambiguous"] else ""
-        if row["status"] == "ok":
-            margin = row["named_by_margin"]
-            named = f" (named by a margin of {margin:.0%})" if not math.isnan(margin) else ""
-            rack_words = f"ok{named}, inlier rmse {row['inlier_rmse_m'] * 1e3:.2f} mm{turn}"
-        else:
-            others = (
-                "; --rack auto tells which of the catalogue's it is"
-                if row["status"] in ("refused", "not_found")
-                else ""
-            )
-            rack_words = f"{row['status']}: {row['reason']}{others}"
-        if row["n_racks_detected"] > 1:
-            rack_words += f" ({row['n_racks_detected']} racks in view, one is answered for: that of the best score)"
-        keys = ("session", "trial", "capture", "frame", "method")
-        of = [e for e in tables.estimates if all(e[key] == row[key] for key in keys) and not e["seed"]]  # none, or 0
-        by = f"{row['method']}: " if len(methods) > 1 else ""
-        say(f"{row['capture']} frame {row['frame']}: rack {row['rack']} {rack_words}; {by}{describe_tubes(of)}")
+    _tell(tables, several=len(methods) > 1)
     if tubes is None and any(not job.tubes for job in jobs):
         say("no --tubes given: only the rack and its slots are estimated")
     finish([*problems, *tables.problems])
 
 
+def _tell(tables: Tables, *, several: bool) -> None:
+    """A line for each rack of each frame, and for each capture in which there is none."""
+    from tubepose_cli.show import describe_tubes, say
+
+    with_rack = {_capture_of(row) for row in tables.racks if row["rack"]}
+    tubes: dict[tuple[str, ...], list[Row]] = {}
+    for row in tables.estimates:
+        if not row["seed"]:  # none, or the first
+            tubes.setdefault(_answer_of(row), []).append(row)
+    for row in tables.racks:
+        if row["rack"]:
+            by = f"{row['method']}: " if several else ""
+            found = describe_tubes(tubes.get(_answer_of(row), []))
+            say(f"{row['capture']} frame {row['frame']}: rack {row['rack']} {_rack_words(row)}; {by}{found}")
+        elif _capture_of(row) in with_rack:  # else its reason is among the problems
+            say(f"{row['capture']} frame {row['frame']}: {row['status']}: {row['reason']}")
+
+
+def _rack_words(row: Row) -> str:
+    """How a rack was found, and what is left open."""
+    if row["status"] == "ok":
+        settle = row["hint_note"] or "--hint SLOT@U,V settles it"
+        turn = f", turn ambiguous by 180 degrees (slot names may be swapped; {settle})" if row["ambiguous"] else ""
+        margin = row["named_by_margin"]
+        named = f" (named by a margin of {margin:.0%})" if not math.isnan(margin) else ""
+        words = f"ok{named}, inlier rmse {row['inlier_rmse_m'] * 1e3:.2f} mm{turn}"
+    else:
+        look = "; --rack auto tells which of the catalogue's it is" if row["status"] in ("refused", "not_found") else ""
+        words = f"{row['status']}: {row['reason']}{look}"
+    if row["n_racks_detected"] > 1:
+        words += f" ({row['n_racks_detected']} racks in view, one is answered for: that of the best score)"
+    return words
+
+
 def _capture_of(row: Row) -> tuple[str, str, str]:
     return row["session"], row["trial"], row["capture"]
+
+
+def _answer_of(row: Row) -> tuple[str, ...]:
+    """What tells the answer of a method to a frame from all others."""
+    return (*_capture_of(row), row["frame"], row["method"])

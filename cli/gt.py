@@ -22,13 +22,14 @@ def gt(
     the exact truth.
     """
     from tubepose.config import Config
-    from tubepose.provenance import run_record
+    from tubepose.provenance import inputs_sha256, run_record
     from tubepose.report.writing import write_json
     from tubepose_cli.inputs import find_sessions
     from tubepose_cli.show import finish, say
     from tubepose_cli.truth import measure_sessions
 
     folders, problems = find_sessions(sessions, fail_fast=fail_fast)
+    used = inputs_sha256(folders, out)
     measured = measure_sessions(folders, out, fail_fast=fail_fast)
     problems += measured.problems
     if not measured.sessions:
@@ -36,10 +37,9 @@ def gt(
     caps = [session.printed_cap for session in measured.sessions if session.printed_cap is not None]
     labware = [item for session in measured.sessions for item in (session.rack, *session.tubes.values())]
     record = run_record(
-        sys.argv, Config(), [*labware, *caps], folders, problems=problems, ground_truth_config=measured.config
+        sys.argv, Config(), [*labware, *caps], used, problems=problems, ground_truth_config=measured.config
     )
     write_json(out / "run.json", record)
-    if measured.sessions:
-        for line in measured.notes:
-            say(line)
+    for line in measured.notes:
+        say(line)
     finish(problems)

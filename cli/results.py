@@ -13,6 +13,11 @@ if TYPE_CHECKING:
     from tubepose.pipeline import Scene, TubeEstimate
 
 
+JUDGED_FILES = (
+    "errors.csv", "summary.csv", "comparison.csv", "uncertainty.csv", "coverage.csv", "confusion.csv", "seeds.csv",
+    "slot_accuracy.csv", *(f"table_{kind}.{form}" for kind in ("accuracy", "timing") for form in ("csv", "md", "tex")),
+)  # fmt: skip
+"""What only a run with truth writes: of an earlier one nothing stays beside other estimates."""
 LONGEST_NAME = 200
 """Bytes of an overlay's name before its numbers; a file system takes 255."""
 
@@ -36,16 +41,17 @@ def run_estimates(
 ) -> Tables:
     """Run jobs and write racks.csv, slots.csv, estimates.csv, timings.csv, run.json and overlays/ into `out`.
 
-    `problems` are those from before, and `labware` what was used besides, for the record.
+    `problems` are those from before, and `labware` what was used besides, for the record. `JUDGED_FILES` of an earlier
+    run are removed.
 
     Raises:
         StoppedError: The user stopped the run. What was done by then is written; nothing where nothing was done.
     """
     from tubepose.batch import Tables, run_jobs
     from tubepose.errors import StoppedError
-    from tubepose.provenance import pinned_threads, run_record
+    from tubepose.provenance import inputs_sha256, pinned_threads, run_record
     from tubepose.records import ESTIMATE_COLUMNS, RACK_COLUMNS, SLOT_COLUMNS, TIMING_COLUMNS, to_table
-    from tubepose.report.writing import make_folder, write_csv, write_json
+    from tubepose.report.writing import make_folder, remove_files, write_csv, write_json
     from tubepose_cli.show import progress, say_when_compiling
 
     taken: dict[str, tuple[str, ...]] = {}
@@ -55,6 +61,7 @@ def run_estimates(
             write_overlay(out / "overlays" / overlay_name(job, scene, taken), scene, estimates)
 
     make_folder(out)
+    used = inputs_sha256([*inputs, *(job.capture.path for job in jobs if job.capture.path.exists())], out)
     say_when_compiling()
     tables, stopped = Tables(), ""
     try:
@@ -66,7 +73,8 @@ def run_estimates(
     except KeyboardInterrupt:
         stopped = f"interrupted: {tables.done} of {len(jobs)} captures are done"
         if not tables.done:
-            raise StoppedError(f"{stopped}; no table is written to {out}") from None
+            raise StoppedError(f"{stopped}; no estimate is written to {out}") from None
+    remove_files(out, JUDGED_FILES)
     write_csv(out / "racks.csv", to_table(tables.racks, RACK_COLUMNS))
     write_csv(out / "slots.csv", to_table(tables.slots, SLOT_COLUMNS))
     write_csv(out / "estimates.csv", to_table(tables.estimates, ESTIMATE_COLUMNS))
@@ -75,7 +83,7 @@ def run_estimates(
         command,
         config,
         [*tables.labware.values(), *labware],
-        [*inputs, *dict.fromkeys(job.capture.path for job in jobs if job.capture.path.exists())],
+        used,
         methods=list(methods),
         seeds=list(range(seeds)),
         threads=1,

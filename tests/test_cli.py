@@ -341,7 +341,7 @@ def test_fail_fast_ends_with_the_first_bad_capture(damaged: Path, tmp_path: Path
     assert digests(tmp_path) == {}
 
 
-@pytest.mark.parametrize(("after", "words"), [(0, "no table is written"), (1, "and in the tables")])
+@pytest.mark.parametrize(("after", "words"), [(0, "no estimate is written"), (1, "and in the tables")])
 def test_ctrl_c_is_one_line_and_what_was_done_is_written(
     after: int, words: str, small_session: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -354,16 +354,19 @@ def test_ctrl_c_is_one_line_and_what_was_done_is_written(
         return prepare(*args)
 
     monkeypatch.setattr(batch, "prepare_scene", stopped)
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / "errors.csv").write_text("of an earlier bench")
     ended = tubepose("estimate", small_session, "--no-overlays", "--out", tmp_path / "out")
     (line,) = ended.errors
     assert ended.code == 130
     assert line.startswith(f"error: interrupted: {after} of ")
     assert words in line
     if after:
+        assert not (tmp_path / "out" / "errors.csv").exists()
         assert set(table(tmp_path / "out" / "racks.csv")["capture"]) == set(asked)
         assert "interrupted: 1 of" in json.loads((tmp_path / "out" / "run.json").read_text())["problems"][0]
     else:
-        assert digests(tmp_path) == {}
+        assert list(digests(tmp_path)) == ["out/errors.csv"]
 
 
 @pytest.mark.parametrize("command", ["estimate", "bench"])

@@ -10,7 +10,7 @@ import pytest
 from tubepose.config import Config
 from tubepose.labware import load_rack, load_tube
 from tubepose.labware.reading import read_labware
-from tubepose.provenance import labware_sha256, pinned_threads, run_record, sha256_of
+from tubepose.provenance import inputs_sha256, labware_sha256, pinned_threads, run_record
 from tubepose.report.writing import write_json
 
 
@@ -19,6 +19,10 @@ def make_folder(place: Path, files: dict[str, str]) -> Path:
         (place / name).parent.mkdir(parents=True, exist_ok=True)
         (place / name).write_text(text)
     return place
+
+
+def sha256_of(path: Path) -> str:
+    return inputs_sha256([path], path.parent / "results")[str(path)]
 
 
 def test_a_files_hash_is_that_of_its_bytes(tmp_path: Path) -> None:
@@ -52,7 +56,8 @@ def test_labware_is_hashed_by_what_it_says_and_not_by_its_file(tmp_path: Path) -
 def test_the_record_is_json_and_holds_what_a_second_run_needs(tmp_path: Path) -> None:
     (tmp_path / "boxes.txt").write_text("0 0.5 0.5 1 1\n")
     labware = [load_rack("chen2023-soft-5x10"), load_tube("chen2023-tube-2")]
-    record = run_record(["tubepose", "x"], Config(), labware, [tmp_path / "boxes.txt"], seeds=[0], odd=float("nan"))
+    used = inputs_sha256([tmp_path / "boxes.txt"], tmp_path / "out")
+    record = run_record(["tubepose", "x"], Config(), labware, used, seeds=[0], odd=float("nan"))
     write_json(tmp_path / "run.json", record)
     read = json.loads((tmp_path / "run.json").read_text())
     assert read["command"] == ["tubepose", "x"]
@@ -63,6 +68,35 @@ def test_the_record_is_json_and_holds_what_a_second_run_needs(tmp_path: Path) ->
     assert any(name.startswith("open3d") for name in read["versions"])
     assert read["machine"]["cores"] >= 1
     assert (read["seeds"], read["odd"]) == ([0], None)
+
+
+def test_results_in_a_session_are_no_part_of_it_and_its_captures_count_with_it(tmp_path: Path) -> None:
+    session, out = tmp_path / "s", tmp_path / "s" / "results"
+    (session / "one").mkdir(parents=True)
+    (session / "one" / "cloud.ply").write_text("ply")
+    (tmp_path / "model.onnx").write_text("m")
+    paths = [session, session / "one", tmp_path / "model.onnx", tmp_path / "model.onnx"]
+    before = inputs_sha256(paths, out)
+    assert list(before) == [str(session), str(tmp_path / "model.onnx")]
+    out.mkdir()
+    (out / "racks.csv").write_text("rack\n")
+    assert inputs_sha256(paths, out) == before
+    assert inputs_sha256(paths, tmp_path / "elsewhere") != before
+    assert inputs_sha256(paths, session) == inputs_sha256(paths, tmp_path / "elsewhere")
+    (session / "one" / "cloud.ply").write_text("other")
+    assert inputs_sha256(paths, out)[str(session)] != before[str(session)]
+
+
+def test_what_cannot_be_read_is_recorded_as_such(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "a.ply").write_text("ply")
+
+    def refuse(_: Path) -> str:
+        raise PermissionError(13, "Permission denied")
+
+    monkeypatch.setattr("tubepose.provenance.file_sha256", refuse)
+    assert inputs_sha256([tmp_path / "a.ply"], tmp_path / "out") == {
+        str(tmp_path / "a.ply"): "cannot be read: Permission denied"
+    }
 
 
 def test_threads_are_bounded_inside_and_as_before_after() -> None:

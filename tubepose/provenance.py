@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import os
 import platform
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -21,8 +21,8 @@ from tubepose.config import Config
 from tubepose.labware import CapModel, RackModel, TubeModel
 
 PACKAGES = (
-    "numpy", "scipy", "open3d", "open3d-cpu", "onnxruntime", "opencv-python-headless", "pandas", "mcap",
-    "kiss-matcher", "small_gicp",
+    "numpy", "scipy", "numba", "llvmlite", "open3d", "open3d-cpu", "onnxruntime", "opencv-python-headless", "pandas",
+    "mcap", "kiss-matcher", "small_gicp",
 )  # fmt: skip
 
 
@@ -44,9 +44,23 @@ def pinned_threads(count: int = 1) -> Iterator[None]:
         o3d.utility.set_max_threads(open3d_before)
 
 
-def sha256_of(path: Path) -> str:
-    """SHA-256 of a file; of a folder, of the listing of its files, as in `data_manifest.yaml`."""
-    return file_sha256(path) if path.is_file() else tree_sha256(path)
+def inputs_sha256(paths: Iterable[Path], out: Path) -> dict[str, str]:
+    """SHA-256 of files; of folders, of the listing of their files, as in `data_manifest.yaml`.
+
+    Args:
+        paths: Files and folders; what lies in a folder that is among them counts with that folder alone.
+        out: Where results go; nothing in it counts. Take the digests before anything is written there.
+    """
+    paths = list(dict.fromkeys(paths))
+    within = [path for path in paths if any(other in path.parents for other in paths)]
+    return {str(path): _sha256(path, out) for path in paths if path not in within}
+
+
+def _sha256(path: Path, out: Path) -> str:
+    try:
+        return file_sha256(path) if path.is_file() else tree_sha256(path, out)
+    except OSError as problem:
+        return f"cannot be read: {problem.strerror}"
 
 
 def labware_sha256(item: RackModel | TubeModel | CapModel) -> str:
@@ -58,7 +72,7 @@ def run_record(
     command: Sequence[str],
     config: Config,
     labware: Sequence[RackModel | TubeModel | CapModel],
-    inputs: Sequence[Path],
+    inputs: Mapping[str, str],
     **more: Any,
 ) -> dict[str, Any]:
     """Contents of `run.json`.
@@ -67,7 +81,7 @@ def run_record(
         command: The command line.
         config: The resolved configuration.
         labware: Every definition that was used.
-        inputs: Captures, sessions and model files.
+        inputs: Digests of captures, sessions and model files, as `inputs_sha256` takes them.
         more: What else the command wants to keep (methods, seeds, threads, detector).
     """
     return {
@@ -77,7 +91,7 @@ def run_record(
         "versions": {"python": platform.python_version(), **_versions()},
         "machine": machine(),
         "labware_sha256": {item.name: labware_sha256(item) for item in labware},
-        "inputs_sha256": {str(path): sha256_of(path) for path in inputs},
+        "inputs_sha256": dict(inputs),
         **more,
     }
 

@@ -201,12 +201,16 @@ def file_sha256(path: Path) -> str:
     return digest.hexdigest()
 
 
-def tree_sha256(folder: Path) -> str:
+def tree_sha256(folder: Path, without: Path | None = None) -> str:
     """Digest of a folder: of the lines ``sha256  path`` of its files, sorted by path; as `sha256sum` prints them.
 
-    Files and folders whose names start with a dot, and `__pycache__`, do not count.
+    Files and folders whose names start with a dot, and `__pycache__`, do not count, nor does a folder `without` in it.
     """
-    return _listing_sha256((file_sha256(file), path) for path, file in _files(folder))
+    left_out = None if without is None or without.resolve() == folder.resolve() else without.resolve()
+    files = [
+        (path, file) for path, file in _files(folder) if left_out is None or left_out not in file.resolve().parents
+    ]
+    return _listing_sha256((file_sha256(file), path) for path, file in files)
 
 
 def _listing_sha256(files: Iterable[tuple[str, str]]) -> str:

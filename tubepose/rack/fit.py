@@ -1,7 +1,7 @@
 """The rack's pose in six degrees of freedom, from its plane and from the edges of its ribs, openings and outline.
 
-What one round of it does is in `fit_kernels`. Points below the top are not used here: next to an edge they mix two depths,
-and lie on the side that the projector's shadow leaves. `Labels` has them as evidence all the same.
+What one round of it does is in `fit_kernels`. Points below the top are not used here: next to an edge they mix two
+depths, and lie on the side that the projector's shadow leaves. `Labels` has them as evidence all the same.
 """
 
 from __future__ import annotations
