@@ -54,6 +54,11 @@ def run() -> None:
     except TubePoseError as problem:
         print(f"error: {problem}", file=sys.stderr)
         sys.exit(130 if isinstance(problem, StoppedError) else 1)
+    except OSError as problem:
+        if problem.filename is None:
+            raise
+        print(f"error: {problem.filename}: {problem.strerror}", file=sys.stderr)
+        sys.exit(1)
     except SystemError as problem:
         if not is_interrupt(problem):
             raise

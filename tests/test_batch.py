@@ -256,6 +256,14 @@ def test_fail_fast_raises_at_the_first_trial_without_its_capture(session: Sessio
         session_jobs(session, fail_fast=True)
 
 
+def test_captures_of_one_name_are_told_apart_by_their_paths(session: Session) -> None:
+    first, second, _ = session.trials
+    trials = (first.model_copy(update={"original": "folder/a"}), second.model_copy(update={"printed": "scan-2/a"}))
+    twins = session.model_copy(update={"trials": trials})
+    assert trial_capture(twins, trials[0], "folder/a").name == "folder/a"
+    assert trial_capture(twins, trials[1], "scan-2").name == "scan-2"
+
+
 def test_a_trial_names_one_capture(session: Session) -> None:
     assert trial_capture(session, session.trials[1], "scan-2").name == "scan-2"
     with pytest.raises(CaptureError, match="trial two needs one capture, found 2"):

@@ -167,6 +167,19 @@ def test_zeros_and_nan_are_invalid_and_keep_their_place(tmp_path):
     assert np.isnan(frame.points_m[:2]).all()
 
 
+def test_a_folder_that_may_not_be_read_is_listed_and_the_others_are_read(tmp_path, monkeypatch):
+    for name in ("a", "b", "c"):
+        write_folder_capture(tmp_path / name, make_frame())
+    closed = tmp_path / "b"
+    monkeypatch.setattr("os.access", lambda path, _mode: Path(path) != closed)
+    found = open_captures(tmp_path)
+    assert [capture.name for capture in found] == ["a", "b", "c"]
+    for capture in (found[1], *open_captures(closed)):
+        with pytest.raises(CaptureError, match="b: may not be read by this user; change its permissions"):
+            list(capture.frames())
+    assert len(list(found[2].frames())) == 1
+
+
 @pytest.mark.parametrize(("unit", "scale"), [(None, 1.0), ("m", 1.0), ("mm", 1e-3)])
 def test_unit_of_a_ply(tmp_path, unit, scale):
     path = write_ply(tmp_path / "scan.ply", np.array([[100.0, 200.0, 300.0]]))

@@ -6,6 +6,7 @@ from importlib.metadata import entry_points
 from pathlib import Path
 
 import pytest
+from commands import tubepose
 from typer.testing import CliRunner
 
 from tubepose import __version__
@@ -160,3 +161,16 @@ def test_help_names_every_command() -> None:
 def test_the_command_is_installed() -> None:
     (script,) = entry_points(group="console_scripts", name="tubepose")
     assert script.load() is main.run
+
+
+def test_a_place_that_cannot_be_written_is_one_line(tmp_path):
+    (tmp_path / "file").write_text("mine")
+    for command in (
+        ("labware", "show", "chen2023-tube-1", "--out", tmp_path / "file" / "x.png"),
+        ("detector", "render", "--count", "1", "--side", "96", "--out", tmp_path / "file"),
+    ):
+        ended = tubepose(*command)
+        assert ended.code == 1
+        assert len(ended.errors) == 1
+        assert str(tmp_path / "file") in ended.err
+    assert (tmp_path / "file").read_text() == "mine"

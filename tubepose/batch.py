@@ -9,6 +9,7 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import partial
+from pathlib import Path
 
 from tubepose.capture.frame import RgbdFrame
 from tubepose.capture.session import Session, SlotHint, Trial
@@ -130,15 +131,19 @@ def session_jobs(session: Session, *, fail_fast: bool = False) -> tuple[list[Job
 
 
 def trial_capture(session: Session, trial: Trial, relative: str) -> Capture:
-    """The one capture that a trial names.
+    """The one capture that a trial names; by its path in the session where others of it have the same last name.
 
     Raises:
         CaptureError: It is not there, or it is a folder of several.
     """
-    topics = {f"{kind}_topic": name for kind, name in session.topics.model_dump().items()}
-    found = open_captures(session.folder / relative, unit=session.unit, **topics)
+    place = session.folder / relative
+    paths = {path for one in session.trials for path in (one.original, one.printed) if path is not None}
+    whole = Path(relative).with_suffix("" if place.is_file() else Path(relative).suffix).as_posix()
+    name = whole if sum(Path(path).stem == Path(relative).stem for path in paths) > 1 else None
+    topics = {f"{kind}_topic": topic for kind, topic in session.topics.model_dump().items()}
+    found = open_captures(place, name=name, unit=session.unit, **topics)
     if len(found) != 1:
-        raise CaptureError(f"{session.folder / relative}: trial {trial.name} needs one capture, found {len(found)}")
+        raise CaptureError(f"{place}: trial {trial.name} needs one capture, found {len(found)}")
     return found[0]
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -57,24 +58,32 @@ class Capture(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class UnreadableCapture:
-    """A file of a known format that is not read: it keeps its row among the captures, with what to do about it."""
+    """A file or folder that is not read: it keeps its row among the captures, with what to do about it.
+
+    Attributes:
+        name: As the tables show it.
+        path: The file or folder.
+        why: What it is, and what to do.
+    """
 
     name: str
     path: Path
+    why: str
 
     def frames(self) -> Iterator[RgbdFrame]:
         """Yield nothing.
 
         Raises:
-            CaptureError: Always; says how to convert the file.
+            CaptureError: Always; says why.
         """
-        raise CaptureError(f"{self.path}: {_CONVERT[self.path.suffix.lower()]}")
+        raise CaptureError(f"{self.path}: {self.why}")
         yield
 
 
 def open_captures(
     path: Path,
     *,
+    name: str | None = None,
     unit: str | None = None,
     cloud_topic: str | None = None,
     image_topic: str | None = None,
@@ -85,6 +94,7 @@ def open_captures(
 
     Args:
         path: A capture folder, a PLY file, an MCAP file, or a directory that is searched for them, in sorted order.
+        name: Of a single capture; by default it is named after its folder or file.
         unit: ``m`` or ``mm``, unit of clouds: goes before `capture.yaml`; without either a cloud is in metres. ``mm``
             is the unit of a depth image's counts too where no `depth_scale_m` is given; in recordings they keep theirs.
         cloud_topic: PointCloud2 topic of MCAP files.
@@ -93,7 +103,7 @@ def open_captures(
         info_topic: CameraInfo topic of MCAP files.
 
     Returns:
-        Captures in sorted order. One is named after its folder or file; those of a directory by their path.
+        Captures in sorted order; those of a directory are named by their path in it.
 
     Raises:
         CaptureError: No such path, nothing to open there, or a unit that is none.
@@ -101,8 +111,8 @@ def open_captures(
     opener = _Opener(_unit(unit), TopicChoice(cloud_topic, image_topic, depth_topic, info_topic))
     if not path.exists():
         raise CaptureError(f"{path}: no such file or folder")
-    if path.is_file() or is_capture_folder(path):
-        capture = opener.open(path, path.stem if path.is_file() else path.resolve().name)
+    if path.is_file() or _is_closed(path) or is_capture_folder(path):
+        capture = opener.open(path, name or (path.stem if path.is_file() else path.resolve().name))
         if capture is not None:
             return [capture]
         raise CaptureError(
@@ -117,6 +127,8 @@ class _Opener:
     topics: TopicChoice
 
     def open(self, path: Path, name: str) -> Capture | None:
+        if _is_closed(path):
+            return UnreadableCapture(name, path, "may not be read by this user; change its permissions")
         if path.is_dir():
             return FolderCapture(name, path, self.unit)
         suffix = path.suffix.lower()
@@ -124,7 +136,12 @@ class _Opener:
             return PlyCapture(name, path, self.unit)
         if suffix == ".mcap":
             return McapCapture(name, path, self.unit, self.topics)
-        return UnreadableCapture(name, path) if suffix in _CONVERT else None
+        return UnreadableCapture(name, path, _CONVERT[suffix]) if suffix in _CONVERT else None
+
+
+def _is_closed(path: Path) -> bool:
+    """True for a folder whose content this user may not see."""
+    return path.is_dir() and not os.access(path, os.R_OK | os.X_OK)
 
 
 def _search(path: Path, opener: _Opener) -> list[Capture]:
@@ -158,7 +175,7 @@ def _walk(folder: Path, inside: frozenset[Path] = frozenset()) -> Iterator[Path]
     for entry in sorted(folder.iterdir()):
         if entry.name.startswith(".") or entry.name == TRUTH_FOLDER:
             continue
-        if not entry.is_dir() or is_capture_folder(entry):
+        if not entry.is_dir() or _is_closed(entry) or is_capture_folder(entry):
             yield entry
         elif entry.resolve() not in inside:
             below = list(_walk(entry, inside))
