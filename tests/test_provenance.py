@@ -8,9 +8,9 @@ import open3d as o3d
 import pytest
 
 from tubepose.config import Config
-from tubepose.labware import load_rack, load_tube
+from tubepose.labware import labware_sha256, load_rack, load_tube
 from tubepose.labware.reading import read_labware
-from tubepose.provenance import inputs_sha256, labware_sha256, pinned_threads, run_record
+from tubepose.provenance import inputs_sha256, pinned_threads, run_record
 from tubepose.report.writing import write_json
 
 

@@ -3,6 +3,8 @@
 Needs the extra ``train``; `make train-test` installs it into an environment of its own and runs this.
 """
 
+from dataclasses import replace
+
 import numpy as np
 import pandas as pd
 import pytest
@@ -80,8 +82,12 @@ def test_a_run_that_was_cut_off_learns_what_it_would_have_learned(pictures, tmp_
 
 def test_a_checkpoint_of_another_recipe_is_refused(pictures, tmp_path):
     Trainer(recipe(steps=1), pictures, tmp_path, threads=1).run()
-    with pytest.raises(DetectorError, match="another recipe or other classes"):
+    with pytest.raises(DetectorError, match="another recipe, other pictures or other classes"):
         Trainer(recipe(steps=1, rate=0.1), pictures, tmp_path, threads=1)
+    fewer = replace(pictures, images=pictures.images[:-1], labels=pictures.labels[:-1])
+    with pytest.raises(DetectorError, match="another recipe, other pictures or other classes"):
+        Trainer(recipe(steps=1), fewer, tmp_path, threads=1)
+    assert Trainer(recipe(steps=1), pictures, tmp_path, threads=1).step == 1
 
 
 def test_a_training_can_start_from_another_one(pictures, tmp_path):

@@ -1,4 +1,5 @@
 import filecmp
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -251,6 +252,13 @@ def test_a_folder_of_another_recipe_or_of_something_else_is_refused(tmp_path):
     write_images(tmp_path / "set", ImageSet(labware(), 1, 96), 1)
     with pytest.raises(DetectorError, match="pictures of another recipe"):
         write_images(tmp_path / "set", ImageSet(labware(), 2, 96), 1)
+    tall = load_tube("chen2023-tube-2")
+    body = tall.body.model_copy(update={"height_mm": tall.body.height_mm + 5})
+    changed = replace(labware(), tubes=(tall.model_copy(update={"body": body}),))
+    same_names = ImageSet(replace(labware(), tubes=(tall,)), 1, 96)
+    write_images(tmp_path / "one", same_names, 1)
+    with pytest.raises(DetectorError, match="pictures of another recipe"):
+        write_images(tmp_path / "one", replace(same_names, labware=changed), 1)
     (tmp_path / "full").mkdir()
     (tmp_path / "full" / "thesis.doc").write_text("mine")
     with pytest.raises(DetectorError, match="not empty"):

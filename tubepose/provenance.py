@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import os
 import platform
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -18,7 +17,7 @@ from threadpoolctl import threadpool_limits
 from tubepose import __version__
 from tubepose.capture.manifest import file_sha256, tree_sha256
 from tubepose.config import Config
-from tubepose.labware import CapModel, RackModel, TubeModel
+from tubepose.labware import Labware, labware_sha256
 
 PACKAGES = (
     "numpy", "scipy", "numba", "llvmlite", "open3d", "open3d-cpu", "onnxruntime", "opencv-python-headless", "pandas",
@@ -63,15 +62,10 @@ def _sha256(path: Path, out: Path) -> str:
         return f"cannot be read: {problem.strerror}"
 
 
-def labware_sha256(item: RackModel | TubeModel | CapModel) -> str:
-    """SHA-256 of a definition's content, wherever it was read from."""
-    return hashlib.sha256(item.model_dump_json().encode()).hexdigest()
-
-
 def run_record(
     command: Sequence[str],
     config: Config,
-    labware: Sequence[RackModel | TubeModel | CapModel],
+    labware: Sequence[Labware],
     inputs: Mapping[str, str],
     **more: Any,
 ) -> dict[str, Any]:

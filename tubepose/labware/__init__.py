@@ -1,7 +1,16 @@
 """Racks, tubes and printed caps: definitions in YAML, a built-in catalogue, and the geometry that follows from them."""
 
 from tubepose.labware.racks import RackModel, SlotGrid, SlotModel, SlotShape
-from tubepose.labware.reading import Labware, catalogue, load_cap, load_rack, load_tube, read_labware, unique_tubes
+from tubepose.labware.reading import (
+    Labware,
+    catalogue,
+    labware_sha256,
+    load_cap,
+    load_rack,
+    load_tube,
+    read_labware,
+    unique_tubes,
+)
 from tubepose.labware.tubes import CapModel, TubeModel, WallOptics
 
 __all__ = [
@@ -14,6 +23,7 @@ __all__ = [
     "TubeModel",
     "WallOptics",
     "catalogue",
+    "labware_sha256",
     "load_cap",
     "load_rack",
     "load_tube",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import hashlib
 from collections.abc import Iterable, Sequence
 from functools import cache
 from importlib.resources import files
@@ -37,6 +38,11 @@ class _Loader(yaml.SafeLoader):
                 raise yaml.composer.ComposerError(None, None, told, key.start_mark)
             seen.add((key.tag, key.value))
         return node
+
+
+def labware_sha256(item: Labware) -> str:
+    """SHA-256 of a definition's content, wherever it was read from."""
+    return hashlib.sha256(item.model_dump_json().encode()).hexdigest()
 
 
 def read_yaml(path: Path, error: type[TubePoseError]) -> dict[str, Any]:

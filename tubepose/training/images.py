@@ -23,6 +23,7 @@ from tubepose.detection.box_writing import write_yolo_txt
 from tubepose.detection.boxes import box_from_edges
 from tubepose.detection.model import CAPPED_CLASS, OPEN_CLASS, Detection
 from tubepose.errors import DetectorError
+from tubepose.labware import labware_sha256
 from tubepose.labware.tubes import RACK_CLASS
 from tubepose.report import write_aside, write_csv, write_text
 from tubepose.simulation.parallel import in_processes
@@ -73,6 +74,7 @@ class ImageSet:
             "racks": sorted(rack.name for rack in self.labware.racks),
             "tubes": sorted(tube.name for tube in self.labware.tubes),
             "printed_caps": sorted(cap.name for cap in self.labware.caps),
+            "labware_sha256": {item.name: labware_sha256(item) for item in self.labware.items},
             "variants": self.labware.variants,
             "held_out_grounds": self.labware.held_out,
             "simulated": True,

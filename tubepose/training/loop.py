@@ -89,7 +89,8 @@ class Trainer:
             start: Checkpoint of another training, whose averaged weights this one starts from, or a model of one.
 
         Raises:
-            DetectorError: A package is missing, a checkpoint is of another recipe or other classes, or `start` is none.
+            DetectorError: A package is missing, a checkpoint is of another recipe, other pictures or other classes, or
+                `start` is none.
         """
         import torch
 
@@ -187,7 +188,7 @@ class Trainer:
         return [float(torch.as_tensor(found[name]).detach()) for name in _LOSSES]
 
     def _identity(self) -> str:
-        return self.recipe.sha256(*self.files.classes, *([self.start_sha256] if self.start_sha256 else []))
+        return self.recipe.sha256(self.files.fingerprint(), self.start_sha256)
 
     def _save(self) -> None:
         import torch
@@ -209,8 +210,8 @@ class Trainer:
         state = torch.load(file, map_location=self.device, weights_only=True)
         if state["identity"] != self._identity():
             raise DetectorError(
-                f"{file}: a checkpoint of another recipe or other classes; remove it to start anew, or give the "
-                "options it was started with"
+                f"{file}: a checkpoint of another recipe, other pictures or other classes; remove it to start anew, "
+                "or give the options it was started with"
             )
         self.network.load_state_dict(state["network"])
         self.average.load_state_dict(state["average"])

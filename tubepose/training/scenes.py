@@ -94,6 +94,11 @@ class Labware:
     fill: tuple[float, float] | None = None
     mixed: float = 0.0
 
+    @property
+    def items(self) -> tuple[RackModel | TubeModel | CapModel, ...]:
+        """Every definition, by its name."""
+        return tuple(sorted((*self.racks, *self.tubes, *self.caps), key=lambda item: item.name))
+
 
 class _Builder:
     """Collects the parts and objects of one scene, table frame: z up, the table at 0."""
