@@ -106,7 +106,8 @@ def compared(exact: Path, other: Path) -> Iterator[str]:
         growth = (means[1] / means[0] - 1).dropna()
         worst = str(growth.idxmax()) if len(growth) else ""
         share = f"{growth.max() * 100:+.1f} %" if len(growth) else ""
-        yield f"| {key[0]} | {key[1]} | {len(first)} | {kept[0]} | {kept[1]} | {share} | {worst} |"
+        expected = int((first["outcome"] != "false").sum())
+        yield f"| {key[0]} | {key[1]} | {expected} | {kept[0]} | {kept[1]} | {share} | {worst} |"
 
 
 def timed(images: Path, model: Path, threads: int) -> Iterator[str]:

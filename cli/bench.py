@@ -23,7 +23,10 @@ ALL_METHODS = "upright,profile,paper,slot-icp,global-icp"
 
 
 def bench(
-    sessions: Annotated[list[Path] | None, typer.Argument(help="Session folders; default: the bundled sample.")] = None,
+    sessions: Annotated[
+        list[Path] | None,
+        typer.Argument(parser=named, metavar="SESSIONS", help="Session folders; default: the sample."),
+    ] = None,
     out: Annotated[
         Path,
         typer.Option(parser=named, metavar="PATH", help="Folder for the results; nothing is written anywhere else."),

@@ -18,7 +18,12 @@ if TYPE_CHECKING:
 
 def estimate(
     captures: Annotated[
-        list[Path], typer.Argument(help="Capture folders, .ply or .mcap files, session folders, or folders of those.")
+        list[Path],
+        typer.Argument(
+            parser=named,
+            metavar="CAPTURES",
+            help="Capture folders, .ply or .mcap files, session folders, or folders of those.",
+        ),
     ],
     out: Annotated[
         Path,

@@ -12,7 +12,7 @@ from tubepose_cli.paths import named
 
 
 def gt(
-    sessions: Annotated[list[Path], typer.Argument(help="Session folders.")],
+    sessions: Annotated[list[Path], typer.Argument(parser=named, metavar="SESSIONS", help="Session folders.")],
     out: Annotated[Path, typer.Option(parser=named, metavar="PATH", help="Folder for the results.")],
     fail_fast: Annotated[bool, typer.Option("--fail-fast", help="Stop at the first bad capture.")] = False,
 ) -> None:

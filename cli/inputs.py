@@ -181,9 +181,12 @@ def refuse_twins(
     for job in found:
         key = (job.session, job.trial, job.capture.name)
         if key in places:
+            same = places[key].resolve() == job.capture.path.resolve()
             problems.append(
-                f"{job.capture.path}: {places[key]} has the same name '{job.capture.name}', so the rows could not be "
-                "told apart; give the folder above both, or rename one"
+                f"{job.capture.path}: given twice; its rows are there once"
+                if same
+                else f"{job.capture.path}: {places[key]} has the same name '{job.capture.name}', so the rows could not "
+                "be told apart; give the folder above both, or rename one"
             )
             continue
         places[key] = job.capture.path

@@ -214,6 +214,14 @@ def test_header_with_another_number_of_points_is_not_believed(tmp_path):
     assert frame.cloud_m.shape == (1, 5, 3)
 
 
+@pytest.mark.parametrize("sides", [(6, 1), (1, 6)])
+def test_a_cloud_of_one_row_is_not_organised(tmp_path, sides):
+    header = "obj_info num_cols {}\nobj_info num_rows {}\n".format(*sides)
+    frame = read_one(write_ply(tmp_path / "scan.ply", np.ones((6, 3)), header))
+    assert not frame.organised
+    assert frame.cloud_m.shape == (1, 6, 3)
+
+
 def test_image_of_as_many_pixels_organises_a_cloud(tmp_path):
     xyz = np.arange(18, dtype=float).reshape(6, 3) + 1
     write_ply(tmp_path / "shot" / "cloud.ply", xyz)

@@ -413,6 +413,7 @@ def test_captures_of_one_name_are_not_mixed_up(small_session: Path, tmp_path: Pa
     one_error(tubepose("estimate", *paths, *options), f"{paths[1]}: {paths[0]} has the same name 'scan'", "give the")
     assert len(table(tmp_path / "out" / "racks.csv")) == 1
     one_error(tubepose("estimate", *paths, *options, "--fail-fast"), "has the same name")
+    one_error(tubepose("estimate", paths[0], paths[0], *options), f"{paths[0]}: given twice; its rows are there once")
 
 
 def test_known_rack_needs_the_exact_truth_and_says_which_session_has_none(small_session: Path, tmp_path: Path) -> None:

@@ -172,7 +172,8 @@ def _colours(vertex: _Element, columns: dict[str, NDArray[np.generic]]) -> NDArr
 
 def _size(header: _Header, count: int) -> tuple[int, int] | None:
     width, height = header.size.get("cols", 0), header.size.get("rows", 0)
-    return (width, height) if count and width * height == count else None
+    # One row or one column is how a cloud without pixels is written.
+    return (width, height) if min(width, height) > 1 and width * height == count else None
 
 
 def encode_ply(points_m: FloatArray, size: tuple[int, int] | None) -> bytes:

@@ -94,15 +94,14 @@ class _TopView:
         return np.asarray((flat[..., :2] - self.low) * self.zoom)
 
     def render(self) -> Picture:
-        picture = np.full((*self.size, 3), 30, np.uint8)
-        if len(self.flat) == 0:
-            return picture
-        pixels = (self.flat[:, :2] - self.low) * self.zoom
-        shade = np.clip(np.interp(self.flat[:, 2], np.percentile(self.flat[:, 2], [2, 98]), [90, 230]), 0, 255)
-        for (u, v), value in zip(pixels.astype(int), shade, strict=True):
-            if 0 <= u < self.size[1] and 0 <= v < self.size[0]:
-                picture[max(v - 1, 0) : v + 2, max(u - 1, 0) : u + 2] = value
-        return picture
+        gray = np.full(self.size, 30, np.uint8)
+        if len(self.flat):
+            u, v = ((self.flat[:, :2] - self.low) * self.zoom).astype(int).T
+            inside = (u >= 0) & (u < self.size[1]) & (v >= 0) & (v < self.size[0])
+            shade = np.interp(self.flat[:, 2], np.percentile(self.flat[:, 2], [2, 98]), [90, 230]).astype(np.uint8)
+            np.maximum.at(gray, (v[inside], u[inside]), shade[inside])
+            gray = np.asarray(cv2.dilate(gray, np.ones((3, 3), np.uint8)))
+        return np.repeat(gray[..., None], 3, axis=2)
 
 
 def _background(scene: Scene) -> tuple[Picture, Project]:
