@@ -324,12 +324,14 @@ def test_symmetric_layout_without_hint_is_ambiguous() -> None:
     assert reason_of(result, "B3").startswith("frame: ambiguous turn")
 
 
+@pytest.mark.parametrize("known", [True, False], ids=["intrinsics", "organised-cloud-alone"])
 @pytest.mark.parametrize("yaw_deg", [20.0, 200.0])
-def test_hint_resolves_a_symmetric_layout(yaw_deg: float) -> None:
+def test_hint_resolves_a_symmetric_layout(yaw_deg: float, known: bool) -> None:
     scene = Scene(layout=SYMMETRIC, yaw_deg=yaw_deg)
+    frame = scene.frame() if known else replace(scene.frame(), intrinsics=None)
     opening = np.array([*RACK.slot("A1").center_m, RACK.height_m])
     u, v = CAMERA.project(transform_points(scene.T_camera_rack, opening))
-    result = scene.measure(hint=SlotHint(slot="A1", pixel=(float(u) + 3, float(v) - 2)))
+    result = scene.measure(frame, hint=SlotHint(slot="A1", pixel=(float(u) + 3, float(v) - 2)))
     assert result.status == "ok"
     np.testing.assert_allclose(invert_transform(scene.T_camera_rack) @ result.T_camera_rack, np.eye(4), atol=3e-4)
 

@@ -8,7 +8,7 @@ from typing import TypeGuard
 
 from tubepose.baselines import fit_global_icp, fit_slot_icp, fit_upright
 from tubepose.capture.frame import CameraIntrinsics, RgbdFrame
-from tubepose.capture.registration import estimate_intrinsics, refuse_mirrored
+from tubepose.capture.registration import known_intrinsics, refuse_mirrored
 from tubepose.capture.session import SlotHint
 from tubepose.config import Config
 from tubepose.detection import Detection, Detector, points_in_box
@@ -69,9 +69,7 @@ def prepare_scene(
     """
     clock = Clock()
     refuse_mirrored(frame)
-    intrinsics = frame.intrinsics
-    if intrinsics is None and frame.organised:
-        intrinsics = estimate_intrinsics(frame.cloud_m)
+    intrinsics = known_intrinsics(frame)
 
     def registered(boxes: Sequence[Detection]) -> RackPose:
         with clock.stage("rack"):

@@ -81,6 +81,13 @@ def project_cloud(points_m: FloatArray, T_image_cloud: FloatArray, intrinsics: C
     return organised.reshape(intrinsics.height, intrinsics.width, 3)
 
 
+def known_intrinsics(frame: RgbdFrame) -> CameraIntrinsics | None:
+    """Intrinsics of a frame: its own, else those that its organised cloud implies; None where neither is there."""
+    if frame.intrinsics is None and frame.organised:
+        return estimate_intrinsics(frame.cloud_m)
+    return frame.intrinsics
+
+
 def estimate_intrinsics(cloud_m: FloatArray) -> CameraIntrinsics | None:
     """Pinhole intrinsics that an organised cloud implies: least squares of u on X/Z and of v on Y/Z.
 

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from tubepose.capture.frame import RgbdFrame
+from tubepose.capture.registration import known_intrinsics
 from tubepose.capture.session import SlotHint
 from tubepose.ground_truth.caps import Cap, find_caps
 from tubepose.ground_truth.model import GroundTruthConfig, GroundTruthResult, TubeTruth
@@ -162,12 +163,13 @@ def _hinted_turn(hint_m: list[float], config: GroundTruthConfig) -> int | None:
 
 def _hint_distance_m(frame: RgbdFrame, T_camera_rack: FloatArray, scene: _Scene, hint: SlotHint | None) -> float:
     """Distance of the hint to its slot's opening on the rack's top, metres; NaN without a hint or intrinsics."""
-    if hint is None or frame.intrinsics is None:
+    intrinsics = None if hint is None else known_intrinsics(frame)
+    if hint is None or intrinsics is None:
         return float("nan")
     opening = np.array([*scene.rack.slot(hint.slot).center_m, scene.rack.height_m])
     in_camera = transform_points(T_camera_rack, opening)
-    offset_px = frame.intrinsics.project(in_camera) - np.array(hint.pixel)
-    return float(np.linalg.norm(offset_px) * in_camera[2] / frame.intrinsics.fx)
+    offset_px = intrinsics.project(in_camera) - np.array(hint.pixel)
+    return float(np.linalg.norm(offset_px) * in_camera[2] / intrinsics.fx)
 
 
 def _assign(T_camera_rack: FloatArray, placed: list[_Placed], scene: _Scene) -> GroundTruthResult:
