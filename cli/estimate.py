@@ -154,7 +154,7 @@ def _rack_words(row: Row) -> str:
     """How a rack was found, and what is left open."""
     if row["status"] == "ok":
         settle = row["hint_note"] or "--hint SLOT@U,V settles it"
-        turn = f", turn ambiguous by 180 degrees (slot names may be swapped; {settle})" if row["ambiguous"] else ""
+        turn = f", may stand another way round (slot names may be swapped; {settle})" if row["ambiguous"] else ""
         margin = row["named_by_margin"]
         named = f" (named by a margin of {margin:.0%})" if not math.isnan(margin) else ""
         words = f"ok{named}, inlier rmse {row['inlier_rmse_m'] * 1e3:.2f} mm{turn}"

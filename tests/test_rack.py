@@ -10,14 +10,20 @@ from scipy.spatial.transform import Rotation
 
 from tubepose.capture.session import SlotHint
 from tubepose.config import Config, RackConfig
-from tubepose.labware import load_rack, load_tube
+from tubepose.labware import RackModel, load_rack, load_tube
 from tubepose.rack import RackStatus, register_rack
-from tubepose.transforms import HALF_TURN, invert_transform, make_transform, transform_points
+from tubepose.transforms import HALF_TURN, QUARTER_TURN, invert_transform, make_transform, transform_points
 
 CONFIG = Config()
 SOFT = load_rack("chen2023-soft-5x10")
 HARD = load_rack("chen2023-hard-5x10")
 MIXED = load_rack("mixed-6x15ml-4x50ml")
+SQUARE = RackModel.model_validate(
+    {
+        "kind": "rack", "name": "square", "outline_mm": [96, 96], "height_mm": 60, "floor_mm": 4,
+        "grid": {"rows": 5, "columns": 5, "pitch_mm": [18, 18], "slot": {"shape": "round", "size_mm": [15, 15]}},
+    }
+)  # fmt: skip
 T_CAMERA_SOFT = scenes.camera_from_rack(SOFT, yaw_rad=0.3, tilt_rad=0.2)
 
 
@@ -110,6 +116,26 @@ def test_a_hint_far_from_both_places_decides_nothing_and_the_note_says_which_tur
             again = register_rack(scan, SOFT, CONFIG, told, scenes.CAMERA)
             assert (again.resolved_by, again.hint_note) == ("hint", "")
             assert_same_pose(again.T_camera_rack, pose.T_camera_rack @ turn)
+
+
+@pytest.mark.parametrize("yaw_deg", [10, 80, 170, 280, 350])
+def test_a_rack_that_a_quarter_turn_leaves_as_it_is_has_four_turns(yaw_deg):
+    T_true = scenes.camera_from_rack(SQUARE, np.deg2rad(yaw_deg))
+    scan = transform_points(T_true, scenes.rack_top(SQUARE))
+    pose = register_rack(scan, SQUARE, CONFIG)
+    assert (pose.ambiguous, pose.resolved_by) == (True, "rule")
+    sums = [(pose.T_camera_rack @ np.linalg.matrix_power(QUARTER_TURN, k))[:2, 0].sum() for k in range(4)]
+    assert np.argmax(sums) == 0
+    place = transform_points(T_true, np.array([*SQUARE.slot("B3").center_m, SQUARE.height_m]))
+    u, v = scenes.CAMERA.project(place)
+    told = register_rack(scan, SQUARE, CONFIG, SlotHint(slot="B3", pixel=(u + 3, v - 2)), scenes.CAMERA)
+    assert (told.ambiguous, told.resolved_by) == (False, "hint")
+    assert_same_pose(told.T_camera_rack, T_true)
+    # The covariance is about the axes of the pose that is given.
+    axes = np.kron(np.eye(2), T_true[:3, :3].T @ pose.T_camera_rack[:3, :3])
+    np.testing.assert_allclose(axes.T @ told.covariance @ axes, pose.covariance, rtol=1e-3, atol=2e-11)
+    lost = register_rack(scan, SQUARE, CONFIG, SlotHint(slot="B3", pixel=(-900.0, 50.0)), scenes.CAMERA)
+    assert len(re.findall(r"-?\d+,-?\d+ (?:or|in)|-?\d+,-?\d+:", lost.hint_note)) == 4
 
 
 def test_a_hint_without_intrinsics_is_not_used(soft_scan):

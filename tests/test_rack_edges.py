@@ -7,14 +7,20 @@ import pytest
 import scenes
 
 from tubepose.config import Config
-from tubepose.labware import load_rack, load_tube
+from tubepose.labware import RackModel, load_rack, load_tube
 from tubepose.rack import RackStatus, agreement, edges, fit, looks, register_rack, settling
 from tubepose.rack.acceptance import too_coarse
 from tubepose.rack.field import top_field
 from tubepose.rack.fit import filled, refine
-from tubepose.transforms import HALF_TURN, invert_transform, transform_points, translation
+from tubepose.transforms import HALF_TURN, QUARTER_TURN, invert_transform, transform_points, translation
 
 CONFIG = Config()
+SQUARE = RackModel.model_validate(
+    {
+        "kind": "rack", "name": "square", "outline_mm": [110, 110], "height_mm": 60, "floor_mm": 4,
+        "grid": {"rows": 5, "columns": 5, "pitch_mm": [20, 20], "slot": {"shape": "square", "size_mm": [16, 16]}},
+    }
+)  # fmt: skip
 SOFT = load_rack("chen2023-soft-5x10")
 STEEL = load_rack("steel-round-13mm-5x10")
 MIXED = load_rack("mixed-6x15ml-4x50ml")
@@ -58,10 +64,12 @@ def test_the_field_is_the_racks_signed_distance(rack):
     assert np.abs(found - true)[near].mean() < 1e-5
 
 
-def test_which_tops_are_the_same_after_half_a_turn():
-    assert top_field(SOFT).symmetric
-    assert top_field(STEEL).symmetric
-    assert not top_field(MIXED).symmetric
+def test_which_tops_are_the_same_after_half_a_turn_or_a_quarter():
+    assert top_field(SQUARE).alike == 4
+    assert top_field(SQUARE.model_copy(update={"outline_mm": (110.0, 112.0)})).alike == 2
+    assert top_field(SOFT).alike == 2
+    assert top_field(STEEL).alike == 2
+    assert top_field(MIXED).alike == 1
 
 
 def test_a_rack_full_of_capped_tubes_is_registered_by_slivers_of_its_ribs():
@@ -169,7 +177,7 @@ def test_a_start_some_slots_off_is_moved_before_it_is_refined(monkeypatch, slots
 @pytest.mark.parametrize("every", [1, 3])
 def test_a_place_with_much_less_evidence_than_an_accepted_one_is_not_refined(every):
     points = transform_points(T_TRUE, hidden_by(TOP, SOFT.all_slots[5:30], 9e-3))
-    best = edges.register_at(points, T_TRUE, SOFT, CONFIG.rack)
+    best = settling.register_at(points, T_TRUE, SOFT, CONFIG.rack)
     assert best.reason == ""
 
     def no_rival(shift_m, found):
@@ -181,6 +189,13 @@ def test_a_place_with_much_less_evidence_than_an_accepted_one_is_not_refined(eve
     assert not no_rival(0.0, [best])
     assert not no_rival(half_a_rack, [replace(best, reason="another rack?")])  # nothing is accepted yet
     assert not no_rival(half_a_rack, [])
+
+
+def test_a_quarter_turn_is_the_same_place_for_a_rack_that_it_leaves_as_it_is():
+    for rack, same in ((SQUARE, True), (SOFT, False)):
+        assert edges._same(T_TRUE, T_TRUE @ HALF_TURN, rack)
+        assert edges._same(T_TRUE, T_TRUE @ QUARTER_TURN, rack) == same
+        assert not edges._same(T_TRUE, T_TRUE @ translation([5e-3, 0.0, 0.0]), rack)
 
 
 def test_a_rough_look_at_some_of_the_points_goes_on_with_all_of_them():

@@ -12,6 +12,8 @@ from scipy.spatial.transform import Rotation
 FloatArray = NDArray[np.float64]
 HALF_TURN: FloatArray = np.diag([-1.0, -1.0, 1.0, 1.0])
 """Half a turn about z, shape (4, 4)."""
+QUARTER_TURN: FloatArray = np.array([[0.0, -1, 0, 0], [1, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
+"""A quarter turn about z, shape (4, 4)."""
 
 
 def make_transform(rotation: FloatArray, translation_m: FloatArray) -> FloatArray:

@@ -14,14 +14,15 @@ from tubepose.config import Config, RackConfig, RackTopConfig
 from tubepose.labware import RackModel
 from tubepose.preprocessing import point_spacing_m, thin
 from tubepose.rack.acceptance import outline_words, too_coarse
-from tubepose.rack.agreement import measure_agreement, outline_fits, rough_evidence
+from tubepose.rack.agreement import outline_fits, rough_evidence
 from tubepose.rack.field import top_field
 from tubepose.rack.fit import RoughFit, filled, rack_frame
 from tubepose.rack.looks import on_lattice, seen_near
-from tubepose.rack.pose import MIN_POINTS, RackPose, RackStatus, choose_turn, unused_hint
+from tubepose.rack.pose import MIN_POINTS, RackPose, RackStatus
 from tubepose.rack.search import Band, levels, search
-from tubepose.rack.settling import Registration, register_at, settled
-from tubepose.transforms import HALF_TURN, FloatArray
+from tubepose.rack.settling import Registration, settled
+from tubepose.rack.turns import choose_turn, turns_of, unused_hint
+from tubepose.transforms import FloatArray
 
 # Places whose coarse picture agrees less than this, compared with one that was accepted, are no rivals of it.
 RIVAL_WORTH = 0.4
@@ -179,11 +180,12 @@ def _level(registration: Registration, level: FloatArray, config: RackConfig) ->
 
 
 def _same(T_a: FloatArray, T_b: FloatArray, rack: RackModel) -> bool:
-    """Whether two poses are within 4 mm and 2 degrees, half turns apart or not."""
+    """Whether two poses are within 4 mm and 2 degrees, but for turns that leave the top as it is, and half turns."""
     top = np.array([0.0, 0.0, rack.height_m])
     apart = np.linalg.norm(T_a[:3, :3] @ top + T_a[:3, 3] - T_b[:3, :3] @ top - T_b[:3, 3])
     turned = T_a[:3, :3].T @ T_b[:3, :3]
-    return bool(apart < 4e-3 and turned[2, 2] > 0.9994 and abs(turned[0, 0]) > 0.9994)
+    along = abs(turned[0, : 2 if top_field(rack).alike == 4 else 1]).max()
+    return bool(apart < 4e-3 and turned[2, 2] > 0.9994 and along > 0.9994)
 
 
 def coarse_sample(points_m: FloatArray, config: RackTopConfig) -> FloatArray:
@@ -199,21 +201,12 @@ def _pose(
     hint: SlotHint | None,
     intrinsics: CameraIntrinsics | None,
 ) -> RackPose:
-    turned = best
-    T_turned = best.fit.T_camera_rack @ HALF_TURN
-    if not top_field(rack).symmetric:
-        turned = register_at(points_m, T_turned, rack, config.rack)
-        if (turned.fit.level is None) != (best.fit.level is None):  # compared by the same heights
-            fit = replace(turned.fit, level=best.fit.level)
-            turned = replace(turned, fit=fit, agreement=measure_agreement(points_m, fit, rack, config.rack))
-        T_turned = turned.fit.T_camera_rack
-    if turned.agreement.rmse_m < best.agreement.rmse_m:
-        best, turned, T_turned = turned, best, best.fit.T_camera_rack
-    margin_m = turned.agreement.rmse_m - best.agreement.rmse_m
-    index, resolved_by = choose_turn(best.fit.T_camera_rack, T_turned, margin_m, rack, config.rack, hint, intrinsics)
-    chosen, reason = (best, turned)[index], best.reason
-    turns = (best.fit.T_camera_rack, T_turned)
-    T_given, T_other = turns[index], turns[1 - index]
+    turns = turns_of(best, points_m, rack, config.rack)
+    margin_m = turns[1].agreement.rmse_m - turns[0].agreement.rmse_m
+    T_turns = [turn.T_camera_rack for turn in turns]
+    index, resolved_by = choose_turn(T_turns, margin_m, rack, config.rack, hint, intrinsics)
+    T_given = T_turns.pop(index)
+    chosen, reason = turns[index], turns[0].reason
     seen = chosen.agreement
     return RackPose(
         RackStatus.REFUSED if reason else RackStatus.OK,
@@ -225,18 +218,12 @@ def _pose(
         seen.coverage,
         ambiguous=resolved_by == "rule" and not reason,
         resolved_by="" if reason else resolved_by,
-        hint_note=unused_hint(T_given, T_other, rack, hint, intrinsics) if resolved_by == "rule" and not reason else "",
+        hint_note=unused_hint(T_given, T_turns, rack, hint, intrinsics) if resolved_by == "rule" and not reason else "",
         turn_margin_m=margin_m if index == 0 else -margin_m,
         spacing_m=seen.spacing_m,
-        level_tops=0 if reason or chosen.fit.level is None else chosen.fit.level.count,
-        covariance=None if reason else _turned_covariance(chosen.fit.covariance, index == 1 and turned is best),
+        level_tops=0 if reason else chosen.level_tops,
+        covariance=None if reason else chosen.covariance,
     )
-
-
-def _turned_covariance(covariance: FloatArray, turned: bool) -> FloatArray:
-    """The covariance of the other turn of a symmetric rack: x and y change their signs."""
-    signs = np.array([-1.0, -1, 1, -1, -1, 1]) if turned else np.ones(6)
-    return np.asarray(covariance * np.outer(signs, signs))
 
 
 def _not_found(points_m: FloatArray, rack: RackModel, config: RackConfig, closest: str) -> RackPose:

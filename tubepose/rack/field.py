@@ -41,13 +41,13 @@ class TopField:
         low_m: Place of the first cell, rack frame, shape (2,), metres.
         shape: Cells along x and y.
         table: Per cell the distance (negative in the solid, metres) and its gradient along x and y, shape (X * Y, 3).
-        symmetric: Whether the top is the same after half a turn.
+        alike: How many of the four quarter turns leave the top as it is: 1, 2 or 4.
     """
 
     low_m: FloatArray
     shape: tuple[int, int]
     table: Float32
-    symmetric: bool
+    alike: int
 
     def look_up(self, xy_m: FloatArray) -> tuple[FloatArray, FloatArray, NDArray[np.bool_]]:
         """Distance (N,), gradient (N, 2) and whether the point lies on the grid (N,), of points (N, 2), rack frame."""
@@ -86,8 +86,15 @@ def top_field(rack: RackModel) -> TopField:
         distance[place] = np.maximum(distance[place], -slot.signed_distance_m(xy))
     slopes = np.gradient(distance, GRID_M)
     table = np.stack([distance, *slopes], axis=-1).reshape(-1, 3).astype(np.float32)
-    symmetric = bool(np.abs(distance - distance[::-1, ::-1]).max() < SAME_M)
-    return TopField(np.array([x[0], y[0]]), (len(x), len(y)), table, symmetric)
+    return TopField(np.array([x[0], y[0]]), (len(x), len(y)), table, _alike(distance))
+
+
+def _alike(distance: FloatArray) -> int:
+    def same(quarters: int) -> bool:
+        turned = np.rot90(distance, quarters)
+        return turned.shape == distance.shape and bool(np.abs(distance - turned).max() < SAME_M)
+
+    return 1 if not same(2) else 4 if same(1) else 2
 
 
 @lru_cache(maxsize=32)

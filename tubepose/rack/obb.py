@@ -27,7 +27,8 @@ from tubepose.preprocessing import (
     voxel_downsample,
 )
 from tubepose.rack.acceptance import agreement, outline_words, refusal, too_coarse
-from tubepose.rack.pose import MIN_POINTS, RackPose, RackStatus, choose_turn, unused_hint
+from tubepose.rack.pose import MIN_POINTS, RackPose, RackStatus
+from tubepose.rack.turns import choose_turn, unused_hint
 from tubepose.transforms import HALF_TURN, FloatArray, invert_transform, make_transform, transform_points, translation
 
 
@@ -67,7 +68,7 @@ def register_obb_icp(
     best, turned = _register_all(scan, top, rack, config.rack)
     margin_m = turned.inlier_rmse_m - best.inlier_rmse_m
     index, resolved_by = choose_turn(
-        best.T_camera_rack, turned.T_camera_rack, margin_m, rack, config.rack, hint, intrinsics
+        [best.T_camera_rack, turned.T_camera_rack], margin_m, rack, config.rack, hint, intrinsics
     )
     turns = (best, turned)
     chosen, other = turns[index], turns[1 - index]
@@ -84,7 +85,7 @@ def register_obb_icp(
         coverage,
         ambiguous=resolved_by == "rule" and not reason,
         resolved_by="" if reason else resolved_by,
-        hint_note=unused_hint(chosen.T_camera_rack, other.T_camera_rack, rack, hint, intrinsics)
+        hint_note=unused_hint(chosen.T_camera_rack, [other.T_camera_rack], rack, hint, intrinsics)
         if resolved_by == "rule" and not reason
         else "",
         turn_margin_m=margin_m if chosen is best else -margin_m,

@@ -287,7 +287,7 @@ def place(turn: Turn, rack: RackModel) -> list[Hypothesis]:
     spectrum = fft.rfft2(evidence)
     half = np.array(picture(rack).shape) // 2
     found = []
-    for half_turn in (False,) if top_field(rack).symmetric else (False, True):
+    for half_turn in (False, True) if top_field(rack).alike == 1 else (False,):
         match = fft.irfft2(spectrum * picture_spectrum(rack, size, half_turn), (size, size))
         i, j = np.unravel_index(int(match.argmax()), match.shape)
         center = low + (np.array([i, j]) + 0.5) * PICTURE_M
