@@ -6,7 +6,7 @@
     python -m benchmarks.compare_settings objectives SESSION...    # the costs that Eq. 3 can be read as
 
 With --known-rack the rack's pose is the exact one (simulated sessions only), so that its errors hide nothing.
-Prints, per tube and setting: estimates that are ok, failures, mean tilt error, mean distance error of the bottom.
+Prints, per tube and setting: how many estimates are ok and how many failed, and mean errors.
 Choose on sessions of your own; never on those that a table reports.
 """
 

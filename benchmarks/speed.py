@@ -198,7 +198,7 @@ def measure_all(frames: Sequence[Timed], options: argparse.Namespace, out: Path)
 
 
 def one_core() -> None:
-    """Stay on one core, and tell every library before it is loaded."""
+    """Stay on one core, and say so to what is still to be loaded; `pinned_threads` bounds the rest."""
     for name in _ONE_THREAD:
         os.environ[name] = "1"
     if hasattr(os, "sched_setaffinity"):

@@ -57,8 +57,8 @@ def bench(
 ) -> None:
     """Run every method on sessions, compare with the ground truth, and print the paper's two tables.
 
-    Writes what estimate and gt write, and errors.csv, summary.csv, comparison.csv, seeds.csv,
-    table_accuracy.{csv,md,tex} and table_timing.{csv,md,tex} into --out.
+    Writes what estimate and gt write, and errors, summary, comparison, uncertainty, coverage, confusion, seeds and
+    slot_accuracy.csv, table_accuracy.{csv,md,tex} and table_timing.{csv,md,tex} into --out.
     """
     from dataclasses import replace
 

@@ -9,9 +9,9 @@ import scenes
 from tubepose.config import Config
 from tubepose.labware import RackModel, load_rack, load_tube
 from tubepose.rack import RackStatus, agreement, edges, fit, looks, register_rack, settling
-from tubepose.rack.acceptance import too_coarse
 from tubepose.rack.field import top_field
 from tubepose.rack.fit import filled, refine
+from tubepose.rack.insufficient import too_coarse
 from tubepose.transforms import HALF_TURN, QUARTER_TURN, invert_transform, transform_points, translation
 
 CONFIG = Config()

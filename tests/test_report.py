@@ -10,9 +10,7 @@ import pytest
 from tubepose.config import Config
 from tubepose.errors import ConfigError
 from tubepose.report import (
-    accuracy_rows,
     accuracy_table,
-    timing_rows,
     timing_table,
     write_aside,
     write_csv,
@@ -50,7 +48,7 @@ SUMMARY = pd.DataFrame(
 
 
 def test_accuracy_rows_are_rounded_strings_tube_by_tube_with_counts():
-    rows = accuracy_rows(SUMMARY)
+    rows = accuracy_table(SUMMARY).cells
     assert rows["Tube"].tolist() == ["chen2023-tube-1", "chen2023-tube-1", "my_tube"]
     assert rows["Method"].tolist() == ["paper", "global-icp", "paper"]
     assert rows["R_x (deg)"].tolist() == ["1.23", "1.23", "-"]
@@ -135,7 +133,7 @@ def test_timing_rows_leave_out_warm_up_and_loading():
     assert table.values["median_ms"].tolist()[3] == 11.0
     assert table.values["p95_ms"].tolist()[3] == pytest.approx(14.6)
     assert table.values["n"].tolist() == [2, 1, 1, 3, 2]
-    assert timing_rows(TIMINGS)["Ratio to paper"].tolist() == ["-", "-", "-", "1.00", "3.00"]
+    assert timing_table(TIMINGS).cells["Ratio to paper"].tolist() == ["-", "-", "-", "1.00", "3.00"]
     assert any("load 500.00 ms" in note for note in table.notes)
 
 
@@ -146,7 +144,7 @@ def test_published_times_come_only_when_asked_for():
 
 
 def test_timing_without_the_papers_method_has_no_ratio():
-    rows = timing_rows(TIMINGS[TIMINGS["method"] != "paper"])
+    rows = timing_table(TIMINGS[TIMINGS["method"] != "paper"]).cells
     assert rows["Ratio to paper"].unique().tolist() == ["-"]
 
 

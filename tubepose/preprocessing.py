@@ -154,7 +154,7 @@ def _plane_scatter(points_m: FloatArray) -> float:
     """Standard deviation about a plane, from the median deviation: walls of tubes must not count."""
     kept = points_m
     for _ in range(4):
-        normal, origin = _fit_plane(kept)
+        normal, origin = fit_plane(kept)
         off = np.abs((points_m - origin) @ normal)
         kept = points_m[off <= np.percentile(off, 70)]
     return float(1.4826 * np.median(off))
@@ -195,15 +195,16 @@ def _level_planes(points_m: FloatArray, config: RackTopConfig) -> Iterator[tuple
         support = rest[inliers]
         if len(support) < 50:
             return
-        normal, origin = _fit_plane(support)
+        normal, origin = fit_plane(support)
         yield normal, origin
         rest = np.delete(rest, inliers, axis=0)
 
 
-def _fit_plane(points_m: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Least-squares plane: unit normal towards the camera, and the centroid."""
+def fit_plane(points_m: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Least-squares plane of points (N, 3), camera frame, metres: unit normal towards the camera, and the centroid."""
     centroid = points_m.mean(axis=0)
-    normal = np.linalg.eigh(np.cov((points_m - centroid).T))[1][:, 0]
+    centred = points_m - centroid
+    normal = np.linalg.eigh(centred.T @ centred)[1][:, 0]
     return (-normal if normal @ centroid > 0 else normal), centroid
 
 
@@ -238,7 +239,7 @@ def _outline(points_m: FloatArray, rows: Rows, band: Rows, normal: FloatArray, r
     """Rectangle around the largest connected patch of some rows, dropped onto the band's own plane."""
     if len(rows) < 50 or len(band) < 50:
         return None
-    up, origin = _fit_plane(points_m[band])
+    up, origin = fit_plane(points_m[band])
     if up @ normal < np.cos(np.deg2rad(5)):
         up = normal
     T_top_camera = _level_frame(up, origin)

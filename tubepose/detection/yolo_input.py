@@ -40,10 +40,6 @@ class Letterbox:
         )
         return canvas
 
-    def to_net(self, edges_xyxy: FloatArray) -> FloatArray:
-        """Map box edges (N, 4) from image pixels to network pixels."""
-        return np.asarray(edges_xyxy * np.tile(self.scale, 2) + np.tile(self.pad, 2))
-
     def to_image(self, edges_xyxy: FloatArray) -> FloatArray:
         """Map box edges (N, 4) from network pixels to image pixels."""
         return np.asarray((edges_xyxy - np.tile(self.pad, 2)) / np.tile(self.scale, 2))

@@ -13,10 +13,10 @@ from tubepose.capture.session import SlotHint
 from tubepose.config import Config, RackConfig, RackTopConfig
 from tubepose.labware import RackModel
 from tubepose.preprocessing import point_spacing_m, thin
-from tubepose.rack.acceptance import outline_words, too_coarse
 from tubepose.rack.agreement import outline_fits, rough_evidence
 from tubepose.rack.field import top_field
 from tubepose.rack.fit import RoughFit, filled, rack_frame
+from tubepose.rack.insufficient import outline_words, too_coarse
 from tubepose.rack.looks import on_lattice, seen_near
 from tubepose.rack.pose import MIN_POINTS, RackPose, RackStatus
 from tubepose.rack.search import Band, levels, search

@@ -1,7 +1,7 @@
 """The rack's rival registration: OBB start with every hypothesis, ICP on the template of the top (paper, section IV-A).
 
-A scan of a rack's top cannot always tell which way round the rack stands, and ICP's fitness cannot tell a rack from one
-of another pitch: both are measured here, reported, and decide about the status.
+A scan of a rack's top cannot always tell which way round the rack stands, and ICP's fitness and rmse cannot tell a rack
+from one of another pitch: both are measured here, by the openings too, reported, and decide about the status.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ from itertools import permutations, product
 
 import numpy as np
 import open3d as o3d
+from scipy.spatial import cKDTree
 
 from tubepose.capture.frame import CameraIntrinsics
 from tubepose.capture.session import SlotHint
@@ -26,10 +27,13 @@ from tubepose.preprocessing import (
     to_o3d,
     voxel_downsample,
 )
-from tubepose.rack.acceptance import agreement, outline_words, refusal, too_coarse
+from tubepose.rack.insufficient import outline_words, too_coarse
 from tubepose.rack.pose import MIN_POINTS, RackPose, RackStatus
 from tubepose.rack.turns import choose_turn, unused_hint
 from tubepose.transforms import HALF_TURN, FloatArray, invert_transform, make_transform, transform_points, translation
+
+COVERED_WITHIN_M = 2.5e-3
+COVERAGE_STEP = 7
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -73,8 +77,8 @@ def register_obb_icp(
     turns = (best, turned)
     chosen, other = turns[index], turns[1 - index]
     template_m = rack_template_m(rack, config.rack.template_spacing_m)
-    in_slot, coverage = agreement(scan, chosen.T_camera_rack, template_m, rack, config.rack)
-    reason = refusal(chosen.fitness, chosen.inlier_rmse_m, in_slot, coverage, rack, config.rack)
+    in_slot, coverage = _agreement(scan, chosen.T_camera_rack, template_m, rack, config.rack)
+    reason = _refusal(chosen.fitness, chosen.inlier_rmse_m, in_slot, coverage, rack, config.rack)
     return RackPose(
         RackStatus.REFUSED if reason else RackStatus.OK,
         reason,
@@ -171,3 +175,37 @@ def _icp(
         T_rack_camera = result.transformation
     judged = o3d.pipelines.registration.evaluate_registration(source, target, config.judge_distance_m, T_rack_camera)
     return _Registration(invert_transform(T_rack_camera), float(judged.fitness), float(judged.inlier_rmse))
+
+
+def _agreement(
+    scan_m: FloatArray, T_camera_rack: FloatArray, template_m: FloatArray, rack: RackModel, config: RackConfig
+) -> tuple[float, float]:
+    """Share of the scan inside the openings, and share of the template that the scan covers."""
+    in_rack = transform_points(invert_transform(T_camera_rack), scan_m)
+    inside_outline = np.all(np.abs(in_rack[:, :2]) <= rack.outline_m / 2, axis=1)
+    in_slot = inside_outline & (rack.top_signed_distance_m(in_rack[:, :2]) > config.slot_margin_m)
+    distances, _ = cKDTree(in_rack).query(template_m[::COVERAGE_STEP], distance_upper_bound=COVERED_WITHIN_M)
+    return float(in_slot.mean()), float(np.isfinite(distances).mean())
+
+
+def _refusal(
+    fitness: float, rmse_m: float, in_slot: float, coverage: float, rack: RackModel, config: RackConfig
+) -> str:
+    """Why a registration is no rack, in words; empty if it is one."""
+    checks = (
+        (fitness < config.min_fitness, f"fitness {fitness:.3f}, at least {config.min_fitness} expected"),
+        (
+            rmse_m > config.max_inlier_rmse_m,
+            f"inlier rmse {rmse_m * 1e3:.2f} mm, at most {config.max_inlier_rmse_m * 1e3:.2f} mm expected",
+        ),
+        (
+            in_slot > config.max_in_slot_share,
+            f"{in_slot:.1%} of the top's points lie inside the openings of {rack.name}, "
+            f"at most {config.max_in_slot_share:.1%} expected: another rack?",
+        ),
+        (
+            coverage < config.min_coverage,
+            f"{coverage:.1%} of the top seen, at least {config.min_coverage:.0%} expected",
+        ),
+    )
+    return "; ".join(text for failed, text in checks if failed)

@@ -14,8 +14,8 @@ from tubepose.capture.session import SlotHint
 from tubepose.config import Config
 from tubepose.labware import RackModel
 from tubepose.preprocessing import level_noise_m, plausible_unit_factors, thin
-from tubepose.rack.acceptance import outline_words, too_noisy
 from tubepose.rack.edges import register_edges
+from tubepose.rack.insufficient import outline_words, too_noisy
 from tubepose.rack.obb import register_obb_icp
 from tubepose.rack.pose import MIN_POINTS, RackPose, RackStatus
 from tubepose.transforms import FloatArray

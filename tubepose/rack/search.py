@@ -14,7 +14,8 @@ from scipy import fft
 
 from tubepose.config import RackTopConfig
 from tubepose.labware import RackModel
-from tubepose.rack import view_kernels as view_kernels
+from tubepose.preprocessing import fit_plane
+from tubepose.rack import view_kernels
 from tubepose.rack.field import PICTURE_M, TURNS, picture, picture_spectrum, solid_signature, top_field, turn_signature
 from tubepose.transforms import FloatArray, make_transform
 
@@ -122,14 +123,6 @@ def _settled(
             break
         normal, origin = fit_plane(near)
     return (-normal if normal @ origin > 0 else normal), origin
-
-
-def fit_plane(points_m: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Least-squares plane: unit normal towards the camera, and the centroid."""
-    centroid = points_m.mean(axis=0)
-    centred = points_m - centroid
-    normal = np.linalg.eigh(centred.T @ centred)[1][:, 0]
-    return (-normal if normal @ centroid > 0 else normal), centroid
 
 
 def levels(points_m: FloatArray, config: RackTopConfig) -> Iterator[list[Band]]:

@@ -155,11 +155,6 @@ def accuracy_table(summary: pd.DataFrame, notes: Sequence[str] = (), published: 
     )
 
 
-def accuracy_rows(summary: pd.DataFrame, published: bool = False) -> pd.DataFrame:
-    """The rows of Table I as strings, one column per printed column."""
-    return _accuracy_cells(_accuracy_values(summary, published))
-
-
 def _accuracy_values(summary: pd.DataFrame, published: bool) -> pd.DataFrame:
     rows: list[dict[str, Any]] = []
     for tube in sorted(summary["tube"].unique()):
@@ -215,11 +210,6 @@ def timing_table(timings: pd.DataFrame, notes: Sequence[str] = (), published: bo
         column_spec="ll|ccccc",
         head=(r"Component & per & Mean (ms) & Median (ms) & p95 (ms) & n & Ratio \\",),
     )
-
-
-def timing_rows(timings: pd.DataFrame, published: bool = False) -> pd.DataFrame:
-    """The rows of Table II as strings, one column per printed column."""
-    return _timing_cells(_timing_values(timings, published))
 
 
 def _timing_values(timings: pd.DataFrame, published: bool) -> pd.DataFrame:
