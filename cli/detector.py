@@ -13,7 +13,7 @@ from tubepose_cli.paths import named
 if TYPE_CHECKING:
     from tubepose.detection.evaluation import DetectionReport
     from tubepose.training.images import ImageSet
-    from tubepose.training.scenes import Labware
+    from tubepose.training.scenes import Stock
 
 app = typer.Typer(help="Detectors that learn from labware files alone, and how good they are.", no_args_is_help=True)
 CATALOGUE = "catalogue"
@@ -255,11 +255,11 @@ def _pairs(given: Sequence[str]) -> dict[str, str]:
     return pairs
 
 
-def read_labware_list(names: str) -> Labware:
+def read_labware_list(names: str) -> Stock:
     """Racks, tubes and printed caps of a comma-separated list of names and files, or of the whole catalogue."""
     from tubepose.errors import LabwareError
     from tubepose.labware import CapModel, RackModel, TubeModel, catalogue, read_labware
-    from tubepose.training.scenes import Labware
+    from tubepose.training.scenes import Stock
     from tubepose_cli.inputs import unknown_name
 
     known = catalogue()
@@ -278,4 +278,4 @@ def read_labware_list(names: str) -> Labware:
     caps = tuple(item for item in found if isinstance(item, CapModel))
     if not racks or not tubes:
         raise LabwareError(f"--labware {names}: found {len(racks)} racks and {len(tubes)} tubes, expected one of each")
-    return Labware(racks, tubes, caps)
+    return Stock(racks, tubes, caps)

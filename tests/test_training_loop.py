@@ -20,7 +20,7 @@ from tubepose.training.images import CLASSES, ImageSet, write_images
 from tubepose.training.loop import Recipe, Trainer
 from tubepose.training.network import build_network
 from tubepose.training.pictures import loss_curve
-from tubepose.training.scenes import Labware
+from tubepose.training.scenes import Stock
 
 _WHY = "needs the extra: pip install 'tubepose[train]'"
 torch = pytest.importorskip("torch", reason=_WHY)
@@ -48,7 +48,7 @@ def pictures(tmp_path_factory):
     from tubepose.labware import load_rack, load_tube
 
     folder = tmp_path_factory.mktemp("pictures")
-    labware = Labware((load_rack("round-10ml-3x4"),), (load_tube("centrifuge-10ml"),), (), 0.0)
+    labware = Stock((load_rack("round-10ml-3x4"),), (load_tube("centrifuge-10ml"),), (), 0.0)
     write_images(folder, ImageSet(labware, 3, 128, "scanner"), 4)
     return labelled_set(folder)
 

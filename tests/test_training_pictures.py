@@ -20,7 +20,7 @@ from tubepose.training.augmentation import Views, draw_sample
 from tubepose.training.images import CLASSES, ImageSet, write_images
 from tubepose.training.labels import label_objects
 from tubepose.training.render import render
-from tubepose.training.scenes import Labware, LearningScene, SceneObject, random_scene
+from tubepose.training.scenes import LearningScene, SceneObject, Stock, random_scene
 from tubepose.training.sensor import expose
 from tubepose.training.textures import GROUNDS, HELD_OUT_GROUNDS, SIZE
 from tubepose.training.variants import cap_outline, fits, vary_rack, vary_tube
@@ -41,7 +41,7 @@ def plate(x, y, side, z, surface=GRAY, owner=NOTHING):
 
 
 def labware(**options):
-    return Labware(
+    return Stock(
         (load_rack("chen2023-soft-5x10"), load_rack("round-10ml-3x4")),
         (load_tube("chen2023-tube-1"), load_tube("chen2023-tube-2"), load_tube("centrifuge-10ml")),
         (load_cap("printed-square-16.7"),),

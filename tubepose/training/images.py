@@ -29,7 +29,7 @@ from tubepose.report import write_aside, write_csv, write_text
 from tubepose.simulation.parallel import in_processes
 from tubepose.training.labels import Label, label_objects
 from tubepose.training.render import render
-from tubepose.training.scenes import Labware, View, random_scene
+from tubepose.training.scenes import Stock, View, random_scene
 from tubepose.training.sensor import Quality, expose
 
 CLASSES = (RACK_CLASS, CAPPED_CLASS, OPEN_CLASS)
@@ -52,7 +52,7 @@ class ImageSet:
         quality: How well the camera is set up, as `expose` says; scenes are the same.
     """
 
-    labware: Labware
+    labware: Stock
     seed: int = 0
     long_side_px: int = LONG_SIDE_PX
     view: View = "any"

@@ -73,7 +73,7 @@ class LearningScene:
 
 
 @dataclass(frozen=True, slots=True)
-class Labware:
+class Stock:
     """What pictures are drawn from.
 
     Attributes:
@@ -103,7 +103,7 @@ class Labware:
 class _Builder:
     """Collects the parts and objects of one scene, table frame: z up, the table at 0."""
 
-    def __init__(self, labware: Labware, rng: np.random.Generator) -> None:
+    def __init__(self, labware: Stock, rng: np.random.Generator) -> None:
         self.labware, self.rng = labware, rng
         self.parts: list[tuple[FloatArray, Mesh, Surface, int]] = []
         self.objects: list[tuple[str, FloatArray, FloatArray | None, float]] = []
@@ -232,7 +232,7 @@ class _Builder:
             self.add(make_transform(turn, np.array([*at, 0.0])), parts)
 
 
-def random_scene(labware: Labware, long_side_px: int, rng: np.random.Generator, view: View = "any") -> LearningScene:
+def random_scene(labware: Stock, long_side_px: int, rng: np.random.Generator, view: View = "any") -> LearningScene:
     """Draw a scene.
 
     Args:
@@ -271,7 +271,7 @@ def random_scene(labware: Labware, long_side_px: int, rng: np.random.Generator, 
     return _in_camera(builder, sensor, intrinsics, T_camera_table, random_light(sensor, T_camera_table, rng))
 
 
-def _table(labware: Labware, rng: np.random.Generator) -> list[objects.LocalPart]:
+def _table(labware: Stock, rng: np.random.Generator) -> list[objects.LocalPart]:
     return objects.table_parts(rng, float(rng.choice([0.5, 1.0, 3.0])), held_out=labware.held_out)
 
 
