@@ -112,7 +112,7 @@ def test_training_without_its_packages_names_the_extra(tmp_path, monkeypatch):
     monkeypatch.setattr("importlib.import_module", missing)
     ended = tubepose("detector", "train", "--out", tmp_path / "model.onnx")
     assert ended.code == 1
-    assert "pip install 'tubepose[train]'" in ended.errors[0]
+    assert "pip install '.[train]'" in ended.errors[0]
     for option in ("--sample-side", "--late-side", "--side"):
         ended = tubepose("detector", "train", "--out", tmp_path / "model.onnx", option, "100")
         assert ended.code == 1

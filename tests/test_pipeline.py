@@ -106,7 +106,7 @@ def test_the_paper_recovers_the_poses_in_both_frames(scene):
 @pytest.mark.parametrize("method", sorted(TUBE_METHODS))
 def test_every_method_answers_for_every_target_once(scene, method):
     for package in PACKAGES.get(method, ()):
-        pytest.importorskip(package, reason="an extra: pip install 'tubepose[rivals]'")
+        pytest.importorskip(package, reason="an extra: pip install '.[rivals]'")
     seed = 0 if method in STOCHASTIC else None
     estimates, times = estimate_tubes(scene, method, CONFIG, seed)
     assert [estimate.target for estimate in estimates] == list(scene.targets)

@@ -201,7 +201,7 @@ def test_bench_without_the_extra_ends_before_any_work(monkeypatch, tmp_path):
     ended = tubepose("bench", "--methods", "upright,gicp", "--out", tmp_path / "out")
     assert ended.code == 1
     assert ended.err.count("error:") == 1
-    assert "pip install 'tubepose[rivals]'" in ended.err.replace("\n", " ")
+    assert "pip install '.[rivals]'" in ended.err.replace("\n", " ")
     assert not (tmp_path / "out").exists()
 
 

