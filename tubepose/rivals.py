@@ -91,7 +91,8 @@ def _package(package: str, method: str) -> None:
         import_module(package)
     except ImportError:
         raise TubePoseError(
-            f"method '{method}' needs the package {package}, which is not installed; in a checkout: pip install '.[rivals]'"
+            f"method '{method}' needs the package {package}, which is not installed; in a checkout: "
+            "pip install '.[rivals]'"
         ) from None
 
 
