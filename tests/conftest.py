@@ -6,6 +6,7 @@ timed, as machines differ. `pytest --hypothesis-profile search` tries new ones.
 
 from __future__ import annotations
 
+from collections import Counter
 from pathlib import Path
 from typing import Any
 
@@ -17,18 +18,24 @@ settings.register_profile("same", deadline=None, derandomize=True)
 settings.register_profile("search", deadline=None)
 settings.load_profile("same")
 
-LIGHT = ("test_structured_light.py", "test_simulation_sessions.py", "test_cli.py", "test_truth_tables.py")
+LIGHT = ("test_structured_light.py", "test_simulation_sessions.py", "test_benchmark_surfaces.py")
 """Files that follow light through plastic, whose loops take a minute to compile; the first begins with those."""
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """The files of `LIGHT` before all others, in that order."""
-    items.sort(key=lambda item: LIGHT.index(item.path.name) if item.path.name in LIGHT else len(LIGHT))
+    """The files of `LIGHT` before all others, those with the most tests first."""
+    counts = Counter(item.path.name for item in items)
+
+    def place(item: pytest.Item) -> tuple[int, int, str]:
+        name = item.path.name
+        return LIGHT.index(name) if name in LIGHT else len(LIGHT), -counts[name], name
+
+    items.sort(key=place)
 
 
 @pytest.hookimpl(optionalhook=True)
 def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
-    """One process runs all of `LIGHT`; it compiles what follows light, another what fits poses, and both use both."""
+    """One process runs all of `LIGHT`: it compiles what follows light, another what fits poses, and both use both."""
     from xdist.scheduler import LoadFileScheduling
 
     class LightTogether(LoadFileScheduling):  # type: ignore[misc]
@@ -36,6 +43,7 @@ def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
             file = super()._split_scope(nodeid)
             return "light" if Path(file).name in LIGHT else file
 
+    config.option.loadscopereorder = False  # in the order of the items
     return LightTogether(config, log)
 
 
