@@ -835,7 +835,7 @@ def test_trials_may_call_their_captures_by_the_same_name(small_session: Path, tm
     names = sorted(path.name for path in (tmp_path / "out" / "overlays").iterdir())
     assert len(names) == 2
     for name, tube in zip(names, sorted(SMALL_TUBES), strict=True):
-        assert name.endswith(f"-{tube}-001-original-0000.png")
+        assert name.endswith(f"-captures_{tube}-001_original-0000.png")
 
 
 def test_one_name_means_one_thing_in_a_run(small_session: Path, tmp_path: Path) -> None:

@@ -190,7 +190,7 @@ def test_a_missing_package_is_named_with_what_to_install(monkeypatch, name, pack
         monkeypatch.setitem(sys.modules, other, sys)  # there, whatever it is
     monkeypatch.setitem(sys.modules, package, None)  # importing it raises ImportError
     points, _ = leaning(TUBES[1])
-    with pytest.raises(TubePoseError, match=r"pip install 'tubepose\[rivals\]'") as told:
+    with pytest.raises(TubePoseError, match=r"pip install '\.\[rivals\]'") as told:
         METHODS[name](points, SLOT, TUBES[1], RACK, CONFIG, 0)
     assert f"method '{name}' needs the package {package}" in str(told.value)
     assert "\n" not in str(told.value)
