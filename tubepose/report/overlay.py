@@ -212,7 +212,7 @@ def _legend(width: int, scene: Scene, estimates: Sequence[TubeEstimate]) -> Pict
     if pose.reason:
         rack += f" ({pose.reason})"
     if pose.ambiguous:
-        rack += ", turn ambiguous by 180 deg (chosen by rule)"
+        rack += ", may stand another way round (chosen by rule)"
     counts = {status: sum(e.pose.status.value == status for e in estimates) for status in COLORS_BGR}
     kind = "SIMULATED" if scene.frame.simulated else "recorded"
     lines = [(f"{scene.frame.capture} frame {scene.frame.index} ({kind})", _TEXT_BGR)]
