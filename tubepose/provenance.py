@@ -50,9 +50,8 @@ def inputs_sha256(paths: Iterable[Path], out: Path) -> dict[str, str]:
         paths: Files and folders; what lies in a folder that is among them counts with that folder alone.
         out: Where results go; nothing in it counts. Take the digests before anything is written there.
     """
-    paths = list(dict.fromkeys(paths))
-    within = [path for path in paths if any(other in path.parents for other in paths)]
-    return {str(path): _sha256(path, out) for path in paths if path not in within}
+    given = dict.fromkeys(paths)
+    return {str(path): _sha256(path, out) for path in given if not any(folder in given for folder in path.parents)}
 
 
 def _sha256(path: Path, out: Path) -> str:

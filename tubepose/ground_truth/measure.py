@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from tubepose.capture.frame import RgbdFrame
+from tubepose.capture.frame import CameraIntrinsics, RgbdFrame
 from tubepose.capture.registration import known_intrinsics
 from tubepose.capture.session import SlotHint
 from tubepose.ground_truth.caps import Cap, find_caps
@@ -102,7 +102,8 @@ def measure_ground_truth(
     turns = turns_of(T_camera_any, rack, config)
     placed = [[_place(found, T_camera_rack, scene) for found in caps] for T_camera_rack in turns]
     scores = [_score(in_turn, scene) for in_turn in placed]
-    chosen, problem = _choose_turn(scores, [_hint_distance_m(frame, turn, scene, hint) for turn in turns], config)
+    intrinsics = None if hint is None else known_intrinsics(frame)
+    chosen, problem = _choose_turn(scores, [_hint_distance_m(intrinsics, turn, scene, hint) for turn in turns], config)
     if problem:
         return _refused(scene, problem, ambiguous=chosen is None)
     assert chosen is not None
@@ -161,9 +162,10 @@ def _hinted_turn(hint_m: list[float], config: GroundTruthConfig) -> int | None:
     return int(order[0]) if np.isfinite(first) and second - first > config.hint_margin_m else None
 
 
-def _hint_distance_m(frame: RgbdFrame, T_camera_rack: FloatArray, scene: _Scene, hint: SlotHint | None) -> float:
+def _hint_distance_m(
+    intrinsics: CameraIntrinsics | None, T_camera_rack: FloatArray, scene: _Scene, hint: SlotHint | None
+) -> float:
     """Distance of the hint to its slot's opening on the rack's top, metres; NaN without a hint or intrinsics."""
-    intrinsics = None if hint is None else known_intrinsics(frame)
     if hint is None or intrinsics is None:
         return float("nan")
     opening = np.array([*scene.rack.slot(hint.slot).center_m, scene.rack.height_m])
