@@ -108,6 +108,22 @@ def nearest_tops(centers_m, radii_m, near_m, low_m, cell_m, shape):
 
 
 @compiled
+def crowded_ends(centers_m, radii_m, normals, gap_m, sure):
+    """Which ends of circles (T, S), along normals (S, 2), are nearer than a gap to another `sure` (T,) circle."""
+    crowded = np.zeros((len(radii_m), len(normals)), np.bool_)
+    for t in range(len(radii_m)):
+        for other in range(len(radii_m)):
+            right, ahead = centers_m[t, 0] - centers_m[other, 0], centers_m[t, 1] - centers_m[other, 1]
+            reach = radii_m[t] + radii_m[other] + gap_m
+            if other == t or not sure[other] or right * right + ahead * ahead >= reach * reach:
+                continue
+            for s in range(len(normals)):
+                x, y = right + radii_m[t] * normals[s, 0], ahead + radii_m[t] * normals[s, 1]
+                crowded[t, s] |= math.sqrt(x * x + y * y) - radii_m[other] < gap_m
+    return crowded
+
+
+@compiled
 def grouped(points_m, label, count):
     """Points (N, 3) ordered by their labels from 0 to count - 1, those without one left out, and where each ends."""
     ends = np.zeros(count + 1, np.intp)

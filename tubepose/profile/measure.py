@@ -13,7 +13,7 @@ from tubepose.capture.frame import CameraIntrinsics, RgbdFrame
 from tubepose.config import Config, ProfileConfig
 from tubepose.labware import RackModel, TubeModel
 from tubepose.profile.faint_rims import RimSearch, find_faint_rims
-from tubepose.profile.kernels import cell_values, ends_on_planes, near_planes, nearest_tops
+from tubepose.profile.kernels import cell_values, crowded_ends, ends_on_planes, near_planes, nearest_tops
 from tubepose.profile.outline import NORMALS, OUTLINE_DEPTH_M, SECTORS, Circles, fit_discs, unknown_circles
 from tubepose.profile.plane import TopPlanes, fit_top_planes, unknown_planes
 from tubepose.profile.rims import RimView, fit_rims, rim_view
@@ -261,17 +261,8 @@ def blocked_sectors(
 
     Only tops that are `sure`, shape (T,), block others; all by default.
     """
-    count = len(radius_m)
-    apart = np.linalg.norm(center_m[:, None] - center_m[None], axis=2)
-    near = (apart < radius_m[:, None] + radius_m[None] + gap_m) & ~np.eye(count, dtype=bool)
-    if sure is not None:
-        near &= sure[None]
-    mine, other = np.nonzero(near)
-    edge = center_m[mine, None, :] + radius_m[mine, None, None] * NORMALS
-    gap = np.linalg.norm(edge - center_m[other, None, :], axis=2) - radius_m[other, None]
-    blocked = np.zeros((count, SECTORS), bool)
-    np.logical_or.at(blocked, mine, gap < gap_m)
-    return blocked
+    sure = np.ones(len(radius_m), bool) if sure is None else sure
+    return np.asarray(crowded_ends(center_m, radius_m, NORMALS, gap_m, sure))
 
 
 def _measure_closed(

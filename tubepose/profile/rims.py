@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -78,8 +79,8 @@ def fit_rims(
         bias_m: Error of a whole rim's middle, along x and along y.
     """
     profile, steps_m = _radial_profiles(view, center_m, level_m, radii_m, WIDE_M)
-    moves_m, _, correlation = _ring_scores(profile, steps_m, radii_m, WIDE_M)
-    shift = _whole_ring_shift(moves_m, correlation, blocked)
+    _, _, correlation = _ring_scores(profile, steps_m, radii_m, WIDE_M)
+    shift = _whole_ring_shift(correlation, blocked)
     circles: Circles | None = None
     if not view.is_image:  # depth has no ring where it is too deep: its picture is worth less
         bias_m *= 3
@@ -134,6 +135,39 @@ def _radial_profiles(
     return np.asarray(values), steps
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class _Templates:
+    """What sectors are compared with: rings of K widths, moved outwards by M steps, over B radii.
+
+    Attributes:
+        moves_m: How far each is moved, shape (M,), metres.
+        ring: Brightness of a ring less that of its background, shape (K, B, M).
+        window: Weights of the radii, shape (K, B, M).
+        total: Sum of the weights, shape (K, 1, M).
+        norm2: Squared length of the ring, shape (K, 1, M).
+    """
+
+    moves_m: FloatArray
+    ring: FloatArray
+    window: FloatArray
+    total: FloatArray
+    norm2: FloatArray
+
+
+@lru_cache(maxsize=32)
+def _templates(halves_m: tuple[float, ...], steps_m: tuple[float, ...], search_m: float) -> _Templates:
+    """Rings of half widths, blurred by a bin, with a background as wide as each on either side."""
+    half = np.array(halves_m)[:, None, None]
+    moves = np.arange(-search_m, search_m + BIN_M / 4, BIN_M / 2)
+    off = np.abs(np.array(steps_m)[None, None, :] - moves[None, :, None])
+    ring = np.clip((half + BIN_M / 2 - off) / BIN_M, 0, 1)
+    window = np.clip((2 * half + BIN_M / 2 - off) / BIN_M, 0, 1)
+    total = window.sum(axis=2)
+    template = window * (ring - ((ring * window).sum(axis=2) / total)[..., None])
+    norm2 = (template**2 / np.maximum(window, 1e-9)).sum(axis=2)
+    return _Templates(moves, template.swapaxes(1, 2), window.swapaxes(1, 2), total[:, None, :], norm2[:, None, :])
+
+
 def _ring_scores(
     profile: FloatArray, steps_m: FloatArray, radii_m: FloatArray, search_m: float
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -143,30 +177,31 @@ def _ring_scores(
     """
     if len(radii_m) and not np.ptp(radii_m, axis=0).any():
         radii_m = radii_m[:1]  # one template does for all
-    half = ((radii_m[:, 1] - radii_m[:, 0]) / 2)[:, None, None]
-    moves = np.arange(-search_m, search_m + BIN_M / 4, BIN_M / 2)
-    # A ring blurred by a bin, with a background as wide as itself on either side.
-    off = np.abs(steps_m[None, None, :] - moves[None, :, None])
-    ring = np.clip((half + BIN_M / 2 - off) / BIN_M, 0, 1)
-    window = np.clip((2 * half + BIN_M / 2 - off) / BIN_M, 0, 1)
-    total = window.sum(axis=2)
-    template = window * (ring - ((ring * window).sum(axis=2) / total)[..., None])
-    norm2 = (template**2 / np.maximum(window, 1e-9)).sum(axis=2)
-    window = window.swapaxes(1, 2)
-    score = profile @ template.swapaxes(1, 2)
-    mean = profile @ window / total[:, None, :]
-    scatter = profile**2 @ window - mean**2 * total[:, None, :]
-    return moves, score, score / np.sqrt(np.maximum(norm2[:, None, :] * scatter, 1e-12))
+    halves_m = (radii_m[:, 1] - radii_m[:, 0]) / 2
+    found = _templates(tuple(halves_m.tolist()), tuple(steps_m.tolist()), search_m)
+    score = profile @ found.ring
+    mean = profile @ found.window / found.total
+    scatter = profile**2 @ found.window - mean**2 * found.total
+    return found.moves_m, score, score / np.sqrt(np.maximum(found.norm2 * scatter, 1e-12))
 
 
-def _whole_ring_shift(moves_m: FloatArray, correlation: FloatArray, blocked: NDArray[np.bool_]) -> FloatArray:
-    """Shift of every ring, shape (T, 2), metres, at which its sectors correlate best together."""
+def _whole_ring_shift(correlation: FloatArray, blocked: NDArray[np.bool_]) -> FloatArray:
+    """Shift of every ring, shape (T, 2), metres, at which its sectors correlate best together.
+
+    Correlations (T, SECTORS, M) are those of moves up to `WIDE_M`.
+    """
+    shifts, at = _whole_ring_shifts(correlation.shape[2])
+    return np.asarray(shifts[shift_scores(correlation, blocked, at).argmax(axis=1)])
+
+
+@lru_cache(maxsize=1)
+def _whole_ring_shifts(count: int) -> tuple[FloatArray, NDArray[np.intp]]:
+    """Shifts that are tried, shape (K, 2), metres, and which of `count` moves each one is in a sector, (K, SECTORS)."""
     axis = np.arange(-WIDE_M, WIDE_M + 1e-9, BIN_M)
     shifts = np.stack(np.meshgrid(axis, axis), axis=-1).reshape(-1, 2)
     shifts = shifts[np.hypot(*shifts.T) <= WIDE_M]
-    at = np.rint((shifts @ NORMALS.T - moves_m[0]) / (moves_m[1] - moves_m[0])).astype(np.intp)
-    at = np.clip(at, 0, len(moves_m) - 1)
-    return np.asarray(shifts[shift_scores(correlation, blocked, at).argmax(axis=1)])
+    at = np.rint((shifts @ NORMALS.T + WIDE_M) / (BIN_M / 2)).astype(np.intp)
+    return shifts, np.clip(at, 0, count - 1)
 
 
 def _ring_moves(moves_m: FloatArray, score: FloatArray, correlation: FloatArray) -> tuple[FloatArray, FloatArray]:
