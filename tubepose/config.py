@@ -106,14 +106,19 @@ class RackConfig(_Section):
         max_stray_share: Largest share of such points. On `dev` the right rack has up to 5 %, whatever stands in it, a
             rack of another pitch 12 % or more.
         max_outside_share: Largest share of the top's points just outside the outline (right rack: 0.1 %).
-        max_stretch: How much farther apart, or nearer, than defined slots may lie, beyond three standard deviations;
-            twice as much where less than clear_seen is seen (right rack: 0.9 and 2.3 %; 17.7 and 18 mm differ by
-            1.7 %).
-        min_rims: Smallest share of the points expected near edges of openings: with fewer, the openings are wider.
-        max_through_share: Largest share of what is seen in place of ribs that lies below them (right rack: 3 %).
+        max_gain: Nats by which a named alternative (a row or column more or fewer, no openings, another rack of the
+            catalogue) may be likelier than the rack, where it is so in more than one square (min_gain_sigmas).
+        min_gain_sigmas: An alternative counts if its gain is so many of its standard deviations over squares of 20 mm.
+        max_pitch_mm: How far the outermost slots may lie from where the rack's file has them, because of another pitch;
+            beyond three standard deviations of its measurement, as the three limits below. Half of what a wrong answer is.
+        max_openings_mm: How much wider or narrower openings may be. Sensors' blur moves their edges by up to 0.6 mm each.
+        max_outline_mm: How much larger or smaller the outline may be.
+        max_scale: Largest difference of scale, as a share, of everything that is seen of the rack.
+        max_scale_shift_mm: A difference of scale that moves the rack by more along the line of sight is marked.
+        edge_std_mm: How far a sensor's blur and a projector's shadow move the edge of an outline.
+        max_floor_mm: How far the slots' floor may be seen from where the file has it, beside three standard deviations.
         min_seen: Smallest share of the template that is seen: a rack full of caps shows 5 to 24 %.
         min_seen_held: The same where the tops of what stands in the rack tell its level.
-        min_rims_held: min_rims there: caps hide edges before they hide ribs.
         clear_seen: With this share seen, an accepted pose is not compared with all others that the search finds; with
             less, tops of tubes hold the rack level where they can, and tubes in 60 % of its slots spare the comparison.
         max_unseen_share: Largest share of the top with no points on it, above or below: half of it makes a rack of
@@ -143,12 +148,17 @@ class RackConfig(_Section):
     edge_margin_m: float = 6.0e-4
     max_stray_share: float = 0.08
     max_outside_share: float = 0.01
-    max_stretch: float = 0.015
-    min_rims: float = 0.4
-    max_through_share: float = 0.1
+    max_gain: float = 50.0
+    min_gain_sigmas: float = 1.5
+    max_pitch_mm: float = 1.0
+    max_openings_mm: float = 2.0
+    max_outline_mm: float = 2.5
+    max_scale: float = 0.0075
+    max_scale_shift_mm: float = 2.0
+    edge_std_mm: float = 0.3
+    max_floor_mm: float = 2.0
     min_seen: float = 0.1
     min_seen_held: float = 0.03
-    min_rims_held: float = 0.3
     clear_seen: float = 0.25
     max_unseen_share: float = 0.4
     min_slot_margin: float = 10.0

@@ -25,8 +25,6 @@ from tubepose.transforms import FloatArray, parts
 # Half thickness of the layer that is judged: the standard deviation of heights, but at least that of a good sensor, and
 # no more than the layer that a tube's wall fills with few points.
 JUDGED_M = (0.3e-3, 0.6e-3)
-# Points this near an edge are at the rim of an opening.
-RIM_M = 0.7e-3
 # Heights that tell how rough a scan is.
 SCATTER_M = 2.5e-3
 # The same where tops of tubes hold the rack: most of what shows between them is what stray light has lifted or sunk.
@@ -35,16 +33,8 @@ HELD_SCATTER_M = 1.0e-3
 BORDER_M = 3.5e-3
 # Points nearer than this share their label's error: they count as one.
 INDEPENDENT_M = 1.5e-3
-# Lines of sight this far inside a rib pass through it.
-THROUGH_MARGIN_M = 0.5e-3
 STRIP_POINTS = 3000
 SPACING_SAMPLE = 300
-# So many reasons are told of: the others follow from them as a rule.
-MOST_TOLD = 2
-# A pose that is known no better than this is not known at all.
-LOST_DEG = 45.0
-# Degrees and millimetres, with their part of a covariance.
-_UNITS = ((np.rad2deg(1.0), slice(0, 3)), (1e3, slice(3, 6)))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -57,9 +47,6 @@ class Agreement:
             within `HELD_SCATTER_M` where tubes hold the rack: a rough scan has no tops that hold one.
         fitness: Share of the points at its height that are near its solid part.
         in_slot: Share of them that lie in its openings.
-        through: Share of what is seen where the solid part should be that lies below it.
-        rims: How many of the points on the solid part lie near its edges, over the share of its area that does: near 1
-            where the openings are as wide as the template's, little where they are wider.
         coverage: Share of its solid part that has points.
         evidence: How much likelier the points are with the rack there than anywhere, nats of independent points.
         slot_margin: The same less that of the likeliest pose a slot farther along the rows, columns or diagonals.
@@ -72,8 +59,6 @@ class Agreement:
     rmse_m: float = float("nan")
     fitness: float = 0.0
     in_slot: float = 1.0
-    through: float = 1.0
-    rims: float = 0.0
     coverage: float = 0.0
     evidence: float = 0.0
     slot_margin: float = 0.0
@@ -97,9 +82,6 @@ def measure_agreement(points_m: FloatArray, fit: Fit, rack: RackModel, config: R
     solid, distance = seen.solid_m[known], distance[known]
     if len(solid) < LEAST_POINTS or not np.any(distance < 0):
         return Agreement()
-    free_distance, _, free_known = top.look_up(seen.free_m)
-    under = int(np.count_nonzero(free_distance[free_known] < -THROUGH_MARGIN_M))
-    over = int(np.count_nonzero(distance < -THROUGH_MARGIN_M))
     near = distance < config.judge_distance_m
     beyond = np.max(np.abs(solid[:, :2]) - rack.outline_m / 2, axis=1)
     stray = distance > config.edge_margin_m
@@ -114,8 +96,6 @@ def measure_agreement(points_m: FloatArray, fit: Fit, rack: RackModel, config: R
         fitness=float(np.mean(near)),
         in_slot=float(np.mean(stray[beyond <= 0])) if np.any(beyond <= 0) else 1.0,
         outside=float(np.mean(stray & (beyond > 0) & (beyond < BORDER_M))),
-        through=under / max(under + over, 1),
-        rims=_near_rims(solid[:, :2], distance, rack) / _rim_share(rack),
         coverage=coverage(solid, rack),
         unseen=_unseen(points_m, fit, rack),
         evidence=evidence * alike,
@@ -145,20 +125,6 @@ def _unseen(points_m: FloatArray, fit: Fit, rack: RackModel) -> float:
     return float(1 - hit.mean())
 
 
-@lru_cache(maxsize=32)
-def _rim_share(rack: RackModel) -> float:
-    """Share of the solid part's area that is near an edge."""
-    field = top_field(rack)
-    cells = np.stack(np.unravel_index(np.arange(len(field.table)), field.shape), axis=1)
-    return _near_rims(field.low_m + cells * GRID_M, field.table[:, 0], rack)
-
-
-def _near_rims(xy_m: FloatArray, distance_m: NDArray[np.floating], rack: RackModel) -> float:
-    """Share of the places (N, 2) on the solid part, away from the outline, that are near the edge of an opening."""
-    inner = np.all(np.abs(xy_m) < rack.outline_m / 2 - 2 * RIM_M, axis=1) & (distance_m < 0)
-    return float(np.mean(distance_m[inner] > -RIM_M)) if inner.any() else 0.0
-
-
 def coverage(solid_m: FloatArray, rack: RackModel) -> float:
     """Share of the cells of a rack's solid part that have one of the points (N, 2 or more), frame of its top."""
     top = picture(rack)
@@ -183,79 +149,3 @@ def _spacing(points_m: FloatArray) -> float:
 def outline_fits(seen: Agreement, config: RackConfig) -> bool:
     """Whether the top ends where the rack's does, and is there as a whole; if not, the rack is not found."""
     return seen.outside <= config.max_outside_share and seen.unseen <= config.max_unseen_share
-
-
-def contradiction(seen: Agreement, fit: Fit, rack: RackModel, config: RackConfig) -> str:
-    """Why a fit is not the rack, in words; empty if it is."""
-    checks = (*_misfits(seen, fit, rack, config), *_too_little(seen, fit, config))
-    found = [text for failed, text in checks if failed]
-    more = len(found) - MOST_TOLD
-    return "; ".join(found[:MOST_TOLD]) + (f"; and {more} more like it" if more > 0 else "")
-
-
-def _misfits(seen: Agreement, fit: Fit, rack: RackModel, config: RackConfig) -> tuple[tuple[bool, str], ...]:
-    """What speaks for another rack, and whether it is so."""
-    stretch = np.abs(fit.stretch) - 3 * fit.stretch_std
-    rims = config.min_rims if fit.level is None else config.min_rims_held
-    most = config.max_stretch if seen.coverage >= config.clear_seen else 2 * config.max_stretch
-    return (
-        (
-            seen.rmse_m > config.max_inlier_rmse_m,
-            f"inlier rmse {seen.rmse_m * 1e3:.2f} mm, at most {config.max_inlier_rmse_m * 1e3:.2f} mm expected",
-        ),
-        (
-            seen.in_slot > config.max_stray_share,
-            f"{seen.in_slot:.1%} of the top's points lie inside the openings of {rack.name}, "
-            f"at most {config.max_stray_share:.1%} expected: another rack?",
-        ),
-        (
-            seen.outside > config.max_outside_share,
-            f"{seen.outside:.1%} of the top's points lie just outside the outline of {rack.name}, "
-            f"at most {config.max_outside_share:.1%} expected: another rack?",
-        ),
-        (
-            bool(np.any(stretch > most)),
-            f"the slots lie {fit.stretch[0]:+.1%} and {fit.stretch[1]:+.1%} farther apart than those of {rack.name}, "
-            f"at most {most:.1%} expected: another rack?",
-        ),
-        (
-            seen.rims < rims,
-            f"{seen.rims:.0%} of the points expected near the edges of the openings of {rack.name} are there, at least "
-            f"{rims:.0%} expected: another rack, with wider openings?",
-        ),
-        (
-            seen.through > config.max_through_share,
-            f"{seen.through:.1%} of what is seen in place of the top's solid part lies below it, "
-            f"at most {config.max_through_share:.0%} expected",
-        ),
-    )
-
-
-def _too_little(seen: Agreement, fit: Fit, config: RackConfig) -> tuple[tuple[bool, str], ...]:
-    """What is missing to say that it is the rack, and whether it is so."""
-    most_mm = config.max_shift_std_mm if fit.level is None else config.max_shift_std_held_mm
-    turn_deg, shift_mm = (float(scale * np.sqrt(np.diag(fit.covariance)[k].max())) for scale, k in _UNITS)
-    least = config.min_seen if fit.level is None else config.min_seen_held
-    return (
-        (
-            seen.coverage < least,
-            f"{seen.coverage:.1%} of the top seen, at least {least:.0%} expected",
-        ),
-        (
-            seen.unseen > config.max_unseen_share,
-            f"no points at all on {seen.unseen:.0%} of the top, at most {config.max_unseen_share:.0%} expected: "
-            "is the rack in the image as a whole?",
-        ),
-        (
-            seen.slot_margin < config.min_slot_margin,
-            "the rack could as well stand a slot farther: too little of its edge is seen "
-            f"(margin {seen.slot_margin:.0f} nats, at least {config.min_slot_margin:.0f} expected)",
-        ),
-        (
-            turn_deg > config.max_turn_std_deg or shift_mm > most_mm,
-            "its pose cannot be told at all: too little is seen"
-            if turn_deg > LOST_DEG
-            else f"its pose is uncertain by {turn_deg:.2f} deg and {shift_mm:.2f} mm (standard deviations), "
-            f"at most {config.max_turn_std_deg:g} deg, {most_mm:g} mm expected: too little is seen",
-        ),
-    )

@@ -10,6 +10,7 @@ import numpy as np
 
 from tubepose.capture.frame import CameraIntrinsics
 from tubepose.capture.session import SlotHint
+from tubepose.checks import Check, reason
 from tubepose.config import Config, RackConfig, RackTopConfig
 from tubepose.labware import RackModel
 from tubepose.preprocessing import point_spacing_m, thin
@@ -37,8 +38,8 @@ def register_edges(
 ) -> RackPose:
     """One try of `register_rack` by this method, without the suspicions of unit and noise."""
     if len(points_m) < MIN_POINTS:
-        reason = f"{len(points_m)} valid points on the rack, expected at least {MIN_POINTS}"
-        return RackPose(RackStatus.INSUFFICIENT, reason)
+        few = f"{len(points_m)} valid points on the rack, expected at least {MIN_POINTS}"
+        return RackPose(RackStatus.INSUFFICIENT, few)
     few_m = coarse_sample(points_m, config.rack_top)
     best = best_registration(points_m, few_m, levels(few_m, config.rack_top), rack, config)
     return pose_of(best, points_m, rack, config, hint, intrinsics)
@@ -60,7 +61,7 @@ def pose_of(
     if coarse:
         return RackPose(RackStatus.INSUFFICIENT, coarse, spacing_m=spacing_m)
     if best.reason and not outline_fits(best.agreement, config.rack):
-        return _not_found(points_m, rack, config.rack, best.reason)
+        return replace(_not_found(points_m, rack, config.rack, best.reason), checks=best.checks)
     return _pose(best, points_m, rack, config, hint, intrinsics)
 
 
@@ -136,11 +137,9 @@ def _likeliest(found: list[Registration], rack: RackModel, config: RackConfig) -
     best, next_best = (registration.agreement.evidence_at(spacing_m) for registration in found[:2])
     if best >= config.min_rival_ratio * next_best:
         return found[0]
-    reason = (
-        f"two places look like {rack.name} (evidence {best:.0f} and {next_best:.0f} nats, a ratio of "
-        f"{config.min_rival_ratio:g} expected): too little of its top is seen"
-    )
-    return replace(found[0], reason=reason)
+    ratio = best / max(next_best, 1e-9)
+    check = Check("two_places", ratio, config.min_rival_ratio, False)
+    return replace(found[0], checks=(*found[0].checks, check))
 
 
 def _known(T_camera_rack: FloatArray, been: list[FloatArray], rack: RackModel) -> bool:
@@ -172,11 +171,8 @@ def _level(registration: Registration, level: FloatArray, config: RackConfig) ->
     tilt_deg = float(np.rad2deg(np.arccos(min(1.0, float(registration.fit.T_camera_rack[:3, 2] @ level)))))
     if registration.reason or registration.fit.level is not None or tilt_deg <= config.max_level_deg:
         return registration
-    reason = (
-        f"{registration.agreement.coverage:.1%} of the top seen, and it stands {tilt_deg:.1f} deg off the level of the "
-        f"scene, at most {config.max_level_deg:g} deg expected"
-    )
-    return replace(registration, reason=reason)
+    check = Check("not_level", tilt_deg, config.max_level_deg, False)
+    return replace(registration, checks=(*registration.checks, check))
 
 
 def _same(T_a: FloatArray, T_b: FloatArray, rack: RackModel) -> bool:
@@ -206,23 +202,26 @@ def _pose(
     T_turns = [turn.T_camera_rack for turn in turns]
     index, resolved_by = choose_turn(T_turns, margin_m, rack, config.rack, hint, intrinsics)
     T_given = T_turns.pop(index)
-    chosen, reason = turns[index], turns[0].reason
+    chosen, why = turns[index], reason(turns[0].checks, rack.name)
     seen = chosen.agreement
     return RackPose(
-        RackStatus.REFUSED if reason else RackStatus.OK,
-        reason,
-        None if reason else T_given,
+        RackStatus.REFUSED if why else RackStatus.OK,
+        why,
+        None if why else T_given,
         seen.rmse_m,
         seen.fitness,
         seen.in_slot,
         seen.coverage,
-        ambiguous=resolved_by == "rule" and not reason,
-        resolved_by="" if reason else resolved_by,
-        hint_note=unused_hint(T_given, T_turns, rack, hint, intrinsics) if resolved_by == "rule" and not reason else "",
+        ambiguous=resolved_by == "rule" and not why,
+        resolved_by="" if why else resolved_by,
+        hint_note=unused_hint(T_given, T_turns, rack, hint, intrinsics) if resolved_by == "rule" and not why else "",
         turn_margin_m=margin_m if index == 0 else -margin_m,
         spacing_m=seen.spacing_m,
-        level_tops=0 if reason else chosen.level_tops,
-        covariance=None if reason else chosen.covariance,
+        level_tops=0 if why else chosen.level_tops,
+        covariance=None if why else chosen.covariance,
+        checks=turns[0].checks,
+        bow_m=None if why else chosen.bow_m,
+        bow_std_m=None if why else chosen.bow_std_m,
     )
 
 

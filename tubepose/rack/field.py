@@ -70,12 +70,39 @@ class TopField:
 @lru_cache(maxsize=32)
 def top_field(rack: RackModel) -> TopField:
     """The signed distance field of a rack's top, out to `RING_M` beyond its outline."""
-    half = rack.outline_m / 2
-    counts = np.ceil((half + RING_M) / GRID_M).astype(int)
+    x, y = _axes(rack)
+    return _tabled(x, y, np.maximum(_to_outline(x, y, rack), _to_openings(x, y, rack)))
+
+
+@lru_cache(maxsize=32)
+def openings_field(rack: RackModel) -> TopField:
+    """The same of its openings alone, as if the face went on for ever."""
+    x, y = _axes(rack)
+    return _tabled(x, y, _to_openings(x, y, rack))
+
+
+@lru_cache(maxsize=32)
+def outline_field(rack: RackModel) -> TopField:
+    """The same of its outline alone, as if the face had no openings."""
+    x, y = _axes(rack)
+    return _tabled(x, y, _to_outline(x, y, rack))
+
+
+def _axes(rack: RackModel) -> tuple[FloatArray, FloatArray]:
+    counts = np.ceil((rack.outline_m / 2 + RING_M) / GRID_M).astype(int)
     x, y = (np.arange(-n, n + 1) * GRID_M for n in counts)
+    return x, y
+
+
+def _to_outline(x: FloatArray, y: FloatArray, rack: RackModel) -> FloatArray:
+    half = rack.outline_m / 2
     edge = np.stack(np.broadcast_arrays(np.abs(x)[:, None] - half[0], np.abs(y)[None] - half[1]))
     outside = np.hypot(*np.maximum(edge, 0))
-    distance = np.maximum(outside + np.minimum(edge.max(axis=0), 0), -REACH_M)
+    return np.maximum(outside + np.minimum(edge.max(axis=0), 0), -REACH_M)
+
+
+def _to_openings(x: FloatArray, y: FloatArray, rack: RackModel) -> FloatArray:
+    distance = np.full((len(x), len(y)), -REACH_M)
     for slot in rack.all_slots:
         window = []
         for axis, values in enumerate((x, y)):
@@ -84,6 +111,10 @@ def top_field(rack: RackModel) -> TopField:
         place = tuple(window)
         xy = np.stack(np.meshgrid(x[place[0]], y[place[1]], indexing="ij"), axis=-1)
         distance[place] = np.maximum(distance[place], -slot.signed_distance_m(xy))
+    return distance
+
+
+def _tabled(x: FloatArray, y: FloatArray, distance: FloatArray) -> TopField:
     slopes = np.gradient(distance, GRID_M)
     table = np.stack([distance, *slopes], axis=-1).reshape(-1, 3).astype(np.float32)
     return TopField(np.array([x[0], y[0]]), (len(x), len(y)), table, _alike(distance))

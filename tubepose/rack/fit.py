@@ -6,7 +6,7 @@ depths, and lie on the side that the projector's shadow leaves. `Labels` has the
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import cv2
 import numpy as np
@@ -15,7 +15,7 @@ from tubepose.labware import RackModel
 from tubepose.rack import fit_kernels
 from tubepose.rack import kernels as kernels
 from tubepose.rack import view_kernels as view_kernels
-from tubepose.rack.field import TopField, top_field
+from tubepose.rack.field import TopField, openings_field, outline_field, top_field
 from tubepose.rack.fit_kernels import INSIDE_M, WIDEST_M
 from tubepose.rack.tops import Level
 from tubepose.transforms import FloatArray, make_transform, parts, translation
@@ -34,9 +34,17 @@ ROUGH_POINTS = 4000
 FINE_POINTS = 10_000
 # With so many points astray after the rough rounds, finer ones are of no use.
 HOPELESS_SHARE = 0.35
+# Half widths of the heights that a bowed face is first fitted to: a plane has cut its ends off.
+BOW_WIDTHS_M = np.geomspace(3.0e-3, 0.6e-3, 8)
+# Light that lifts or sinks whole sides of a rack looks like a bow, too (`INFLATE`): a face is flat unless its bow is
+# less likely than one in a thousand by chance (chi-squared of 3).
+BOW_INFLATE = 3.0
+FLAT_CHI2 = 16.27
 # Edges are looked for at least this near the top.
 EDGE_WINDOW_M = 1.0e-3
 LEAST_POINTS = 20
+# Points this near the outline may be mixed with what lies beside the rack.
+BORDER_M = 0.5e-3
 # Variance of what nothing is known of.
 UNKNOWN = 1e6
 # Of a pose's six numbers those that the plane tells, and those that the edges tell.
@@ -73,6 +81,9 @@ class Fit:
         stretch_std: Standard deviations of that.
         level: The tops of what stands in the rack that hold it level, where little of its own top is seen or that
             leans otherwise; None where its own ribs tell.
+        bow_m: How much higher the face is than the plane at its centre, shape (3,), metres: at the ends of its x axis,
+            of its y axis, and what its corners have besides (`bow_at`); 0 where it is not significant.
+        bow_std_m: Standard deviations of that, shape (3,); of a face that is called flat those of the fit with a bow.
     """
 
     T_camera_rack: FloatArray
@@ -81,6 +92,18 @@ class Fit:
     stretch: FloatArray
     stretch_std: FloatArray
     level: Level | None = None
+    bow_m: FloatArray = field(default_factory=lambda: np.zeros(3))
+    bow_std_m: FloatArray = field(default_factory=lambda: np.full(3, np.inf))
+
+    def laid_flat(self, points_m: FloatArray, rack: RackModel) -> FloatArray:
+        """Points (N, 3), camera frame, as they would lie were the face flat: moved by its bow where they are seen."""
+        if not self.bow_m.any():
+            return points_m
+        T = top_frame(self.T_camera_rack, rack)
+        points_m = np.ascontiguousarray(points_m, float)
+        return np.asarray(
+            fit_kernels.laid_flat(points_m, *parts(T), camera_place(T), rack.outline_m / 2, self.bow_m)
+        )
 
 
 @dataclass(slots=True, eq=False)
@@ -95,6 +118,9 @@ class RoughFit:
         covariance: Of the last round, shape (6, 6).
         stray: Share of the points at the top's height that lie far from its solid part.
         level: What holds the top level; None where its own ribs tell.
+        half_m: Half of the rack's outline along x and y, shape (2,), metres.
+        bow_m: As `Fit.bow_m`, shape (3,).
+        bow_covariance: Of that, shape (3, 3).
     """
 
     T_camera_top: FloatArray
@@ -102,8 +128,11 @@ class RoughFit:
     rough_m: FloatArray
     scatter_m: float
     covariance: FloatArray
+    half_m: FloatArray
     stray: float = 1.0
     level: Level | None = None
+    bow_m: FloatArray = field(default_factory=lambda: np.zeros(3))
+    bow_covariance: FloatArray = field(default_factory=lambda: UNKNOWN * np.eye(3))
 
 
 def top_frame(T_camera_rack: FloatArray, rack: RackModel) -> FloatArray:
@@ -115,9 +144,9 @@ def roughly(points_m: FloatArray, T_camera_rack: FloatArray, rack: RackModel) ->
     """The first rounds from a coarse pose (2 mm and 1.5 degrees off at most), with points (N, 3), camera frame."""
     T = top_frame(T_camera_rack, rack)
     kept = _near_top(points_m, T, rack)
-    state = RoughFit(T, kept, _thinned(kept, ROUGH_POINTS), WIDEST_M, UNKNOWN * np.eye(6))
+    state = RoughFit(T, kept, _thinned(kept, ROUGH_POINTS), WIDEST_M, UNKNOWN * np.eye(6), rack.outline_m / 2)
     for blur_m, widths_m in ROUNDS_M[:ROUGH_ROUNDS]:
-        _step(state.rough_m, state, top_field(rack), blur_m, widths_m, False)
+        _step(state.rough_m, state, top_field(rack), blur_m, widths_m)
     return state
 
 
@@ -134,13 +163,29 @@ def _near_top(points_m: FloatArray, T_camera_top: FloatArray, rack: RackModel) -
 
 
 def refine(state: RoughFit, rack: RackModel) -> Fit:
-    """The other rounds; none where so much lies beside the solid part that they are of no use."""
-    field, fine = top_field(rack), _thinned(state.kept_m, FINE_POINTS)
-    for number, (blur_m, widths_m) in enumerate(ROUNDS_M[ROUGH_ROUNDS:], ROUGH_ROUNDS):
-        if state.stray <= HOPELESS_SHARE:
-            _step(fine, state, field, blur_m, widths_m, number == len(ROUNDS_M) - 1)
-    covariance = _covariance(state, fine, field)
-    return Fit(rack_frame(state, rack), covariance, state.scatter_m, *_stretch(state, field), state.level)
+    """The other rounds; none where so much lies beside the solid part that they are of no use.
+
+    The first of them fits a bow. Where that is not significant, the face is flat.
+    """
+    top, fine = top_field(rack), _thinned(state.kept_m, FINE_POINTS)
+    if state.stray <= HOPELESS_SHARE:
+        flat = replace(state)
+        _step(fine, state, top, ROUNDS_M[ROUGH_ROUNDS][0], BOW_WIDTHS_M, tells=True, bowed=True)
+        bowed = _significant(state.bow_m, state.bow_covariance)
+        if not bowed:
+            flat.bow_covariance = state.bow_covariance
+            state = flat
+        for number, (blur_m, widths_m) in enumerate(ROUNDS_M[ROUGH_ROUNDS:], ROUGH_ROUNDS):
+            _step(fine, state, top, blur_m, widths_m, tells=number == len(ROUNDS_M) - 1, bowed=bowed)
+    covariance = _covariance(state, fine, top)
+    stretch = _stretch(state, rack)
+    bow_std_m = np.sqrt(np.diag(state.bow_covariance))
+    return Fit(rack_frame(state, rack), covariance, state.scatter_m, *stretch, state.level, state.bow_m, bow_std_m)
+
+
+def _significant(bow_m: FloatArray, covariance: FloatArray) -> bool:
+    """Whether a bow is one: less likely than this by chance."""
+    return bool(bow_m @ np.linalg.solve(covariance, bow_m) > FLAT_CHI2)
 
 
 def _covariance(state: RoughFit, points_m: FloatArray, field: TopField) -> FloatArray:
@@ -148,7 +193,9 @@ def _covariance(state: RoughFit, points_m: FloatArray, field: TopField) -> Float
     inflate = INFLATE if state.level is None else INFLATE_HELD
     covariance = np.asarray(inflate @ state.covariance @ inflate + np.diag(FLOOR**2))
     if state.level is None:
-        off_m = np.abs(field.on_solid(points_m, state.T_camera_top, np.inf, INSIDE_M)[:, 2])
+        local = _flat_local(points_m, state)
+        distance, _, known = field.look_up(local)
+        off_m = np.abs(local[known & (distance < -INSIDE_M), 2])
         lifted = float(np.mean(off_m > LIFTED_M)) if len(off_m) else 1.0
         covariance[PLANE] *= 1 + (lifted / LIFTED_SHARE) ** 2
         return covariance
@@ -173,8 +220,15 @@ def rack_frame(state: RoughFit, rack: RackModel) -> FloatArray:
 
 def at_the_top(state: RoughFit, points_m: FloatArray) -> FloatArray:
     """Places of a rough fit's points (all or some) at the height of its top, frame of the top, shape (N, 2), metres."""
-    local = to_frame(points_m, state.T_camera_top)
+    local = _flat_local(points_m, state)
     return local[np.abs(local[:, 2]) < max(EDGE_WINDOW_M, min(3 * state.scatter_m, WIDEST_M)), :2]
+
+
+def _flat_local(points_m: FloatArray, state: RoughFit) -> FloatArray:
+    """Points (N, 3) near a top in its frame, their heights those over its bowed face."""
+    local = to_frame(points_m, state.T_camera_top)
+    local[:, 2] -= fit_kernels.bow_at(state.bow_m, *(local[:, :2] / state.half_m).T)
+    return local
 
 
 def _thinned(points_m: FloatArray, count: int) -> FloatArray:
@@ -187,29 +241,51 @@ def to_frame(points_m: FloatArray, T_camera_frame: FloatArray) -> FloatArray:
 
 
 def _step(
-    points_m: FloatArray, state: RoughFit, field: TopField, blur_m: float, widths_m: FloatArray, last: bool
+    points_m: FloatArray,
+    state: RoughFit,
+    field: TopField,
+    blur_m: float,
+    widths_m: FloatArray,
+    *,
+    tells: bool = False,
+    bowed: bool = False,
 ) -> None:
-    """One round of plane and edges, in place; the last one tells their covariance."""
+    """One round of face and edges, in place, with a bow or without; one that `tells` states their covariance."""
     T = state.T_camera_top
     window_m = max(EDGE_WINDOW_M, min(3 * state.scatter_m, float(widths_m[0])))
     held = state.level is not None
-    (plane, scatter_m, normal, scores), inside, (edges, outlines), stray = fit_kernels.round_step(
-        points_m, *parts(T), window_m, blur_m, widths_m, held, *field.grid
+    (face, scatter_m, normal, scores), inside, (edges, outlines), stray = fit_kernels.round_step(
+        points_m, *parts(T), window_m, blur_m, widths_m, held, state.bow_m, 6 if bowed else 3, state.half_m, *field.grid
     )
     state.covariance = UNKNOWN * np.eye(6)
     if len(inside) < LEAST_POINTS:
         return
-    if last:
-        state.covariance[PLANE] = _clustered(normal, scores, inside)
+    if tells:
+        covariance = _clustered(normal, scores, inside)
+        state.covariance[PLANE] = covariance[:3, :3]
         state.covariance[EDGES] = _clustered(*outlines)
+        if bowed:
+            state.bow_covariance = BOW_INFLATE**2 * covariance[3:, 3:]
     state.scatter_m, state.stray = float(scatter_m), float(stray)
-    turn = np.asarray(cv2.Rodrigues(np.array([*plane[:2], edges[0]]))[0], float)
-    state.T_camera_top = np.asarray(T @ make_transform(turn, np.array([*edges[1:], plane[2]])))
+    if bowed:
+        state.bow_m = state.bow_m + face[3:]
+    turn = np.asarray(cv2.Rodrigues(np.array([*face[:2], edges[0]]))[0], float)
+    state.T_camera_top = np.asarray(T @ make_transform(turn, np.array([*edges[1:], face[2]])))
 
 
-def _stretch(state: RoughFit, field: TopField) -> tuple[FloatArray, FloatArray]:
-    """Stretch along x and y with which the template agrees best, and its standard deviations."""
-    moved, edges = fit_kernels.stretched(at_the_top(state, state.rough_m), *field.grid)
+def _stretch(state: RoughFit, rack: RackModel) -> tuple[FloatArray, FloatArray]:
+    """Stretch of the openings' places along x and y with which they agree best, and its standard deviations.
+
+    The outline has no part in it: it is another measure, and would hold the openings where the file has them.
+    """
+    openings = openings_field(rack)
+    xy = at_the_top(state, state.rough_m)
+    beside, _, known = outline_field(rack).look_up(xy)
+    nearer, _, _ = openings.look_up(xy)
+    xy = xy[known & (beside < np.minimum(nearer, -BORDER_M))]
+    if len(xy) < LEAST_POINTS:
+        return np.zeros(2), np.full(2, np.inf)
+    moved, edges = fit_kernels.stretched(xy, *openings.grid)
     if len(edges[1]) < LEAST_POINTS:
         return np.zeros(2), np.full(2, np.inf)
     return np.asarray(moved[3:]), np.sqrt(np.diag(_clustered(*edges)))[3:]

@@ -1,6 +1,6 @@
-"""One round of a rack's fit, compiled: the plane of its top, and its edges; see `kernels`.
+"""One round of a rack's fit, compiled: the plane of its top, its bow, and its edges; see `kernels`.
 
-Heights of points on the solid part give the plane. The edges give the rest: a point at the top's height must lie on the
+Heights of points on the solid part give the plane and the bow. The edges give the rest: a point at the top's height must lie on the
 solid part, whose signed distance says how far off it is, less the blur of the sensor. Points on opposite edges of ribs
 push in opposite directions, so a blur that makes every rib look wider, or thinner, moves no pose.
 """
@@ -12,7 +12,7 @@ import math
 import numpy as np
 
 from tubepose.compiled import compiled, solved
-from tubepose.rack.kernels import laid
+from tubepose.rack.kernels import in_frame, laid, numbers
 
 # Where heights scatter more than a good sensor's, wider ones count.
 WIDEST_M = 2.0e-3
@@ -34,6 +34,11 @@ LOST_STRETCH = 0.1
 STRETCH_BLUR_M = 0.5e-3
 # No step shifts a pose by more.
 LONGEST_STEP_M = 1e-3
+# Two of two real racks are bowed by 1 to 2 mm at the ends of their outline; beyond it a face goes on for so much of it.
+BOW_STD_M = 1.5e-3
+BOW_ENDS = 1.2
+# A face is never known to be smoother than this: what makes the prior of its bow count for something.
+SMOOTH_M = 0.1e-3
 # Bins that a median is counted in: it is exact to the range of values over this.
 MEDIAN_BINS = 2048
 # Bins per half window that the densest height is looked for in.
@@ -123,37 +128,56 @@ def cluster_sums(xy_m, scores, side_m):
 
 
 @compiled
-def plane_step(points_m, off_m, balance, reach_m, normal):
-    """One reweighted step of a plane: adds to its normal equations in place, and returns its right side (3,)."""
-    right = np.zeros(3)
+def bow_at(bow_m, along, across):
+    """Height of a bowed face over the plane at its centre; `along` and `across` are 1 at the ends of the outline."""
+    return bow_m[0] * along * along + bow_m[1] * across * across + bow_m[2] * along * across
+
+
+@compiled
+def _face_column(column, x, y, half_x, half_y):
+    """How the height of a face at a place changes with turns about x and y, its height, and the three parts of bow."""
+    if column == 0:
+        return y
+    if column == 1:
+        return -x
+    if column == 2:
+        return 1.0
+    along, across = x / half_x, y / half_y
+    return along * along if column == 3 else across * across if column == 4 else along * across
+
+
+@compiled
+def face_step(points_m, off_m, balance, reach_m, normal, half_m):
+    """One reweighted step of a face: adds to its normal equations (K, K) in place, and returns its right side (K,)."""
+    columns = len(normal)
+    right, design = np.zeros(columns), np.empty(columns)
+    half_x, half_y = half_m[0], half_m[1]
     for k in range(len(points_m)):
         u = off_m[k] / reach_m
         if abs(u) < 1.0:
             weight = balance[k] * (1.0 - u * u) ** 2
-            d0, d1 = points_m[k, 1], -points_m[k, 0]
-            normal[0, 0] += weight * d0 * d0
-            normal[0, 1] += weight * d0 * d1
-            normal[0, 2] += weight * d0
-            normal[1, 1] += weight * d1 * d1
-            normal[1, 2] += weight * d1
-            normal[2, 2] += weight
-            right[0] += weight * off_m[k] * d0
-            right[1] += weight * off_m[k] * d1
-            right[2] += weight * off_m[k]
-    normal[1, 0], normal[2, 0], normal[2, 1] = normal[0, 1], normal[0, 2], normal[1, 2]
+            for i in range(columns):
+                design[i] = _face_column(i, points_m[k, 0], points_m[k, 1], half_x, half_y)
+                right[i] += weight * off_m[k] * design[i]
+                for j in range(i + 1):
+                    normal[j, i] += weight * design[i] * design[j]
+    for i in range(columns):
+        for j in range(i):
+            normal[i, j] = normal[j, i]
     return right
 
 
 @compiled
-def plane_steps(points_m, balance, widths_m, held):
-    """Plane of points (N, 3) where heights are densest, windows narrowed: turns about x, y and height; scatter.
+def face_steps(points_m, balance, widths_m, held, bow_m, half_m, columns):
+    """Face of points (N, 3) where heights are densest, windows narrowed: turns about x and y, height, bow; scatter.
 
-    Returns them with the last normal equations (3, 3) and the scores (N, 3) of the points where the steps ended. Where
-    the level is held, the height alone moves.
+    Of `columns` 3 the bow stays as it is; of 6 it is fitted, with a prior: real racks are bowed by `BOW_STD_M`. Where
+    the level is held, the height (and bow) alone move. Returns the K unknowns, of the bow what it changes by, with the
+    last normal equations (K, K) and the scores (N, K) of the points where the steps ended.
     """
-    stiff = 1e9 if held else 1e-9
-    found, normal = np.zeros(3), np.zeros((3, 3))
-    off, scores = np.empty(len(points_m)), np.zeros((len(points_m), 3))
+    found, normal = np.zeros(columns), np.zeros((columns, columns))
+    off, scores = np.empty(len(points_m)), np.zeros((len(points_m), columns))
+    half_x, half_y = half_m[0], half_m[1]
     for k in range(len(points_m)):
         off[k] = points_m[k, 2]
     found[2] = densest(off, widths_m[0])
@@ -161,22 +185,34 @@ def plane_steps(points_m, balance, widths_m, held):
     reach = scatter
     for width in widths_m:
         for k in range(len(points_m)):
-            off[k] = points_m[k, 2] - points_m[k, 1] * found[0] + points_m[k, 0] * found[1] - found[2]
+            off[k] = points_m[k, 2]
+            for i in range(columns):
+                off[k] -= found[i] * _face_column(i, points_m[k, 0], points_m[k, 1], half_x, half_y)
         scatter = 1.4826 * median_size(off, max(width, 2 * scatter))
         reach = max(width, min(2 * scatter, WIDEST_M))
-        for i in range(3):
-            for j in range(3):
+        for i in range(columns):
+            for j in range(columns):
                 normal[i, j] = 0.0
-        normal[0, 0], normal[1, 1], normal[2, 2] = stiff, stiff, 1e-6
-        step = solved(normal, plane_step(points_m, off, balance, reach, normal))
-        for i in range(3):
+        normal[0, 0] = normal[1, 1] = 1e9 if held else 1e-9
+        normal[2, 2] = 1e-6
+        prior = (max(scatter, SMOOTH_M) / BOW_STD_M) ** 2
+        for i in range(3, columns):
+            normal[i, i] = prior
+        right = face_step(points_m, off, balance, reach, normal, half_m)
+        for i in range(3, columns):
+            right[i] -= prior * (bow_m[i - 3] + found[i])
+        step = solved(normal, right)
+        for i in range(columns):
             found[i] += step[i]
     for k in range(len(points_m)):
         u = off[k] / reach
         if abs(u) < 1.0:
-            now = points_m[k, 2] - points_m[k, 1] * found[0] + points_m[k, 0] * found[1] - found[2]
+            now = points_m[k, 2]
+            for i in range(columns):
+                now -= found[i] * _face_column(i, points_m[k, 0], points_m[k, 1], half_x, half_y)
             score = balance[k] * (1.0 - u * u) ** 2 * now
-            scores[k, 0], scores[k, 1], scores[k, 2] = score * points_m[k, 1], -score * points_m[k, 0], score
+            for i in range(columns):
+                scores[k, i] = score * _face_column(i, points_m[k, 0], points_m[k, 1], half_x, half_y)
     return found, scatter, normal, scores
 
 
@@ -228,19 +264,23 @@ def edge_move(local_m, distance_m, slope, window_m, blur_m, count):
 
 
 @compiled
-def round_step(points_m, rotation, origin_m, window_m, blur_m, widths_m, held, low_m, cell_m, shape, table):
+def round_step(
+    points_m, rotation, origin_m, window_m, blur_m, widths_m, held, bow_m, columns, half_m, low_m, cell_m, shape, table
+):
     """One round over points (N, 3), camera frame, for a top's frame.
 
-    The heights that count are narrowed step by step, so that the plane ends on the mode and not on the mean: light that
+    The heights that count are narrowed step by step, so that the face ends on the mode and not on the mean: light that
     goes astray sinks or lifts whole stretches of ribs. Places count alike, not points: a wall at the outline has most.
 
     Returns:
-        What `plane_steps` gives, and its points (K, 3); what `edge_move` gives; the share of points astray.
+        What `face_steps` gives, and its points (K, 3); what `edge_move` gives; the share of points astray.
     """
-    height_m = max(window_m, widths_m[0])
+    sag_m = abs(bow_m[0]) + abs(bow_m[1]) + abs(bow_m[2])
+    height_m = max(window_m, widths_m[0]) + 1.5 * sag_m
     local, distance, slope = laid(points_m, rotation, origin_m, height_m, low_m, cell_m, shape, table)
     inside, count, astray, total = np.empty((len(local), 3)), 0, 0, 0
     for k in range(len(local)):
+        local[k, 2] -= bow_at(bow_m, local[k, 0] / half_m[0], local[k, 1] / half_m[1])
         if distance[k] < -INSIDE_M:
             inside[count, 0], inside[count, 1], inside[count, 2] = local[k, 0], local[k, 1], local[k, 2]
             count += 1
@@ -251,8 +291,28 @@ def round_step(points_m, rotation, origin_m, window_m, blur_m, widths_m, held, l
     crowd, balance = square_counts(inside, SHARED_LENGTH_M), np.empty(count)
     for k in range(count):
         balance[k] = 1.0 / max(crowd[k], FULL_SQUARE)
-    plane = plane_steps(inside, balance, widths_m, held)
-    return plane, inside, edge_move(local, distance, slope, window_m, blur_m, 3), astray / total
+    face = face_steps(inside, balance, widths_m, held, bow_m, half_m, columns)
+    return face, inside, edge_move(local, distance, slope, window_m, blur_m, 3), astray / max(total, 1)
+
+
+@compiled
+def laid_flat(points_m, rotation, origin_m, camera_m, half_m, bow_m):
+    """Points (N, 3), camera frame, moved along a face's normal by its bow where their lines of sight cross it."""
+    frame = numbers(rotation, origin_m)
+    camera, flat = (camera_m[0], camera_m[1], camera_m[2]), np.empty_like(points_m)
+    for k in range(len(points_m)):
+        right, ahead, up = in_frame(frame, points_m[k, 0], points_m[k, 1], points_m[k, 2])
+        drop = 0.0
+        if up < 0.9 * camera[2]:
+            share = up / (up - camera[2])
+            along = (right + share * (camera[0] - right)) / half_m[0]
+            across = (ahead + share * (camera[1] - ahead)) / half_m[1]
+            # Beyond the outline nothing is known of a face.
+            along, across = min(max(along, -BOW_ENDS), BOW_ENDS), min(max(across, -BOW_ENDS), BOW_ENDS)
+            drop = bow_at(bow_m, along, across)
+        for i in range(3):
+            flat[k, i] = points_m[k, i] - drop * rotation[i, 2]
+    return flat
 
 
 @compiled

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from tubepose.capture.frame import CameraIntrinsics
+from tubepose.checks import Check
 from tubepose.config import Config
 from tubepose.labware import RackModel
 from tubepose.preprocessing import unit_doubt
@@ -83,7 +84,9 @@ def register_grid(
     if best.reason:
         pose = pose_of(best, points_m, rack, config, None, intrinsics)
         return replace(pose, rack=rack, reason=f"{pose.reason}; {MEASURE}")
-    best = replace(best, reason=_miscounted(points_m, best, rack, lattice, config))
+    words = _miscounted(points_m, best, rack, lattice, config)
+    if words:
+        best = replace(best, checks=(*best.checks, Check("grid", float("nan"), float("nan"), False, detail=words)))
     return replace(pose_of(best, points_m, rack, config, None, intrinsics), rack=rack)
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from enum import StrEnum
 
+from tubepose.checks import Check
 from tubepose.labware import RackModel
 from tubepose.transforms import FloatArray
 
@@ -45,6 +46,11 @@ class RackPose:
         rack: The rack that was found where it was not given but looked for; None otherwise.
         level_tops: How many tops of what stands in it hold it level; 0 where its own top tells.
         hint_note: Why a hint that was given decided nothing, where one was needed; empty otherwise.
+        checks: What the registration had to pass; empty from a method that has none, and without a registration.
+        bow_m: How much higher the face is than the plane at its centre, shape (3,), metres: at the ends of its x axis, of
+            its y axis, and what its corners have besides: b(x, y) = bow_x u^2 + bow_y v^2 + bow_xy u v, u = 2 x / length, v =
+            2 y / width. None without a pose, and from a method that takes every face for flat.
+        bow_std_m: Standard deviations of that, shape (3,).
         named_by_margin: By how much the rack's agreement beats the next one's of the catalogue, where the rack was
             named by that: 0 is no difference; NaN otherwise.
     """
@@ -65,3 +71,6 @@ class RackPose:
     named_by_margin: float = float("nan")
     hint_note: str = ""
     level_tops: int = 0
+    checks: tuple[Check, ...] = ()
+    bow_m: FloatArray | None = None
+    bow_std_m: FloatArray | None = None

@@ -9,9 +9,12 @@ from scipy.spatial.transform import Rotation
 
 from tubepose.config import RackConfig
 from tubepose.labware import RackModel
-from tubepose.rack.agreement import Agreement, contradiction, coverage, measure_agreement
+from tubepose.checks import Check, reason
+from tubepose.rack.agreement import Agreement, coverage, measure_agreement
 from tubepose.rack.fit import HOPELESS_SHARE, Fit, RoughFit, at_the_top, leveled, refine, top_frame
 from tubepose.rack.looks import SLOT_STEPS, look_at, on_lattice
+from tubepose.rack.proof import prove
+from tubepose.rack.size import FaceSize
 from tubepose.rack.tops import Level, level_by_tops
 from tubepose.transforms import FloatArray, translation
 
@@ -23,11 +26,26 @@ LEANS_SIGMAS = 4.0
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Registration:
-    """A refined pose, how well the points agree with it, and why it is not believed."""
+    """A refined pose and what became of it.
+
+    Attributes:
+        fit: The pose.
+        agreement: How well the points agree with it.
+        checks: What it had to pass.
+        name: Of the rack.
+        size: What the face's sizes are measured to be; None where a quick look had failed.
+    """
 
     fit: Fit
     agreement: Agreement
-    reason: str
+    checks: tuple[Check, ...]
+    name: str
+    size: FaceSize | None = None
+
+    @property
+    def reason(self) -> str:
+        """Why it is not believed, in words; empty if it is."""
+        return reason(self.checks, self.name)
 
 
 def register_at(points_m: FloatArray, T_camera_rack: FloatArray, rack: RackModel, config: RackConfig) -> Registration:
@@ -96,5 +114,7 @@ def _leans(fit: Fit, level: Level, rack: RackModel) -> bool:
 
 def _refined(near_m: FloatArray, rough: RoughFit, rack: RackModel, config: RackConfig) -> Registration:
     fit = refine(rough, rack)
-    agreement = measure_agreement(near_m, fit, rack, config)
-    return Registration(fit, agreement, contradiction(agreement, fit, rack, config))
+    flat_m = fit.laid_flat(near_m, rack)
+    agreement = measure_agreement(flat_m, fit, rack, config)
+    checks, size = prove(flat_m, fit, agreement, rack, config)
+    return Registration(fit, agreement, checks, rack.name, size)

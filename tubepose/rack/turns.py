@@ -9,6 +9,7 @@ import numpy as np
 
 from tubepose.capture.frame import CameraIntrinsics
 from tubepose.capture.session import SlotHint
+from tubepose.checks import Check
 from tubepose.config import RackConfig
 from tubepose.labware import RackModel
 from tubepose.rack.agreement import Agreement, measure_agreement
@@ -26,14 +27,18 @@ class Turn:
         covariance: Of that pose, shape (6, 6), about and along the turned frame's axes.
         agreement: What the points say of it.
         level_tops: How many tops of tubes hold it level.
-        reason: Why it is refused; empty if it is not.
+        checks: What it had to pass.
+        bow_m: Of its face, shape (3,), along the turned frame's axes, metres; see `Fit.bow_m`.
+        bow_std_m: Standard deviations of that.
     """
 
     T_camera_rack: FloatArray
     covariance: FloatArray
     agreement: Agreement
     level_tops: int
-    reason: str
+    checks: tuple[Check, ...]
+    bow_m: FloatArray
+    bow_std_m: FloatArray
 
 
 def turns_of(best: Registration, points_m: FloatArray, rack: RackModel, config: RackConfig) -> list[Turn]:
@@ -51,7 +56,7 @@ def turns_of(best: Registration, points_m: FloatArray, rack: RackModel, config: 
     turned = register_at(points_m, best.fit.T_camera_rack @ HALF_TURN, rack, config)
     if (turned.fit.level is None) != (best.fit.level is None):  # compared by the same heights
         fit = replace(turned.fit, level=best.fit.level)
-        turned = replace(turned, fit=fit, agreement=measure_agreement(points_m, fit, rack, config))
+        turned = replace(turned, fit=fit, agreement=measure_agreement(fit.laid_flat(points_m, rack), fit, rack, config))
     return sorted((_turn(one, np.eye(4)) for one in (best, turned)), key=lambda turn: turn.agreement.rmse_m)
 
 
@@ -63,8 +68,15 @@ def _turn(registration: Registration, T_registered_turned: FloatArray) -> Turn:
         np.asarray(axes.T @ fit.covariance @ axes),
         registration.agreement,
         0 if fit.level is None else fit.level.count,
-        registration.reason,
+        registration.checks,
+        _bow_turned(fit.bow_m, T_registered_turned),
+        np.abs(_bow_turned(fit.bow_std_m, T_registered_turned)),
     )
+
+
+def _bow_turned(bow_m: FloatArray, T: FloatArray) -> FloatArray:
+    """A bow's three parts (3,) seen from a frame that is turned by a multiple of a quarter turn."""
+    return bow_m if abs(T[0, 0]) > 0.5 else np.array([bow_m[1], bow_m[0], -bow_m[2]])
 
 
 def choose_turn(

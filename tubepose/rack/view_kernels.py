@@ -41,6 +41,33 @@ def labelled(points_m, rotation, origin_m, camera_m, reach_m, window_m, through_
 
 
 @compiled
+def face_cells(points_m, rotation, origin_m, camera_m, low_m, cell_m, shape, window_m, through_m):
+    """Points at a frame's plane, below it, above it, and others, counted in cells (5, X, Y); last, what stands there.
+
+    Points within `window_m` of the plane lie where they are, all others where their line of sight crosses it; above are
+    those more than `through_m` higher. Those are counted where they stand, too.
+    """
+    frame, low_x, low_y = numbers(rotation, origin_m), low_m[0] - 0.5 * cell_m, low_m[1] - 0.5 * cell_m
+    camera = (camera_m[0], camera_m[1], camera_m[2])
+    counts = np.zeros((5, shape[0], shape[1]), np.int32)
+    for k in range(len(points_m)):
+        right, ahead, up = in_frame(frame, points_m[k, 0], points_m[k, 1], points_m[k, 2])
+        if up > 0.9 * camera[2]:
+            continue
+        kind = 0 if abs(up) < window_m else 1 if up < -through_m else 2 if up > through_m else 3
+        if kind == 2:
+            u, v = (right - low_x) / cell_m, (ahead - low_y) / cell_m
+            if 0 <= u < shape[0] and 0 <= v < shape[1]:
+                counts[4, int(u), int(v)] += 1
+        if kind > 0:
+            right, ahead = on_plane(right, ahead, up, camera)
+        u, v = (right - low_x) / cell_m, (ahead - low_y) / cell_m
+        if 0 <= u < shape[0] and 0 <= v < shape[1]:
+            counts[kind, int(u), int(v)] += 1
+    return counts
+
+
+@compiled
 def cells_crossed(points_m, step, rotation, origin_m, camera_m, side_m, shape):
     """Which cells of a rectangle about a frame's origin the lines of sight to every `step`-th point cross."""
     frame, side_x, side_y = numbers(rotation, origin_m), side_m[0], side_m[1]
@@ -168,3 +195,30 @@ def crossed(points_m, step, rotation, origin_m, camera_m):
         right, ahead, up = in_frame(frame, points_m[k * step, 0], points_m[k * step, 1], points_m[k * step, 2])
         at[k, 0], at[k, 1] = on_plane(right, ahead, up, camera)
     return at
+
+
+@compiled
+def cell_logs(solid, nothing, standing, shaded, part_m, rows, hidden, dark, stray, crossed, wrong, shift_m, blur_m):
+    """Log likelihoods (K,) of some cells `rows` (K,), each at a distance from the solid part, (K,); see `Face`.
+
+    `solid` is the share of points at the face's height, NaN without any; `hidden` and `dark` are rates of cells without
+    a return away from what stands up and beside it, (2,) each.
+    """
+    found = np.zeros(len(rows))
+    for k in range(len(rows)):
+        row = rows[k]
+        share = solid[row]
+        seen = share == share
+        if not seen and not nothing[row]:
+            continue
+        eta = (shift_m - part_m[k]) / blur_m
+        s = 1.0 / (1.0 + math.exp(-min(max(eta, -30.0), 30.0)))
+        zone = 1 if shaded[row] else 0
+        none = s * hidden[zone] + (1.0 - s) * dark[zone]
+        if not seen:
+            found[k] = math.log(none)
+            continue
+        other = crossed if standing[row] else stray
+        shown = other + (1.0 - wrong - other) * s
+        found[k] = math.log(1.0 - none) + share * math.log(shown) + (1.0 - share) * math.log(1.0 - shown)
+    return found

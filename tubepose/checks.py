@@ -1,0 +1,124 @@
+"""Checks as data: what was measured, what was allowed, and whether it passed. Words are made here alone."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+MOST_TOLD = 2
+"""So many failed checks are told of: the others follow from them as a rule."""
+
+
+@dataclass(frozen=True, slots=True)
+class Check:
+    """One test of an answer.
+
+    Attributes:
+        code: What was tested, a key of `SENTENCES`.
+        value: What was found, in the unit that the sentence names.
+        limit: What was allowed.
+        passed: Whether it was within that.
+        decides: Whether an answer that fails it is refused; else it is marked.
+        detail: What a number cannot say: a side, the name of a rack.
+    """
+
+    code: str
+    value: float
+    limit: float
+    passed: bool
+    decides: bool = True
+    detail: str = ""
+
+
+SENTENCES = {
+    "inlier_rmse": "inlier rmse {value:.2f} mm, at most {limit:.2f} mm expected",
+    "in_openings": (
+        "{value:.1f}% of the top's points lie inside the openings of {name}, at most {limit:.0f}% expected: another rack?"
+    ),
+    "beside_outline": (
+        "{value:.1f}% of the top's points lie just outside the outline of {name}, at most {limit:.1f}% expected: "
+        "another rack?"
+    ),
+    "little_seen": "{value:.1f}% of the top seen, at least {limit:.0f}% expected",
+    "not_in_view": (
+        "no points at all on {value:.0f}% of the top, at most {limit:.0f}% expected: is the rack in the image as a whole?"
+    ),
+    "slot_step": (
+        "the rack could as well stand a slot farther: too little of its edge is seen (margin {value:.0f} nats, at least "
+        "{limit:.0f} expected)"
+    ),
+    "uncertain_turn": (
+        "its pose is uncertain by {value:.2f} deg (standard deviation), at most {limit:g} deg expected: too little is seen"
+    ),
+    "uncertain_shift": (
+        "its pose is uncertain by {value:.2f} mm (standard deviation), at most {limit:g} mm expected: too little is seen"
+    ),
+    "lost": "its pose cannot be told at all: too little is seen",
+    "row_more": "the scan shows {detail}, which {name} has not (likelier by {value:.0f} nats): another rack, or its file",
+    "row_fewer": "the scan shows {detail} than {name} has (likelier by {value:.0f} nats): another rack, or its file",
+    "no_openings": "the scan shows {detail} rather than {name} (likelier by {value:.0f} nats)",
+    "other_rack": "the scan shows {detail} rather than {name} (likelier by {value:.0f} nats): ask for that one",
+    "tubes_beside": (
+        "{value:.0f} of the places beside the slots of {name}, where {detail} would be, are full: another rack, or its file"
+    ),
+    "pitch_x": (
+        "the slots lie {detail} along x than those of {name}: {value:.2f} mm at the outermost one, at most {limit:g} mm "
+        "expected: another rack, correct pitch_mm, or the cloud's scale"
+    ),
+    "pitch_y": (
+        "the slots lie {detail} along y than those of {name}: {value:.2f} mm at the outermost one, at most {limit:g} mm "
+        "expected: another rack, correct pitch_mm, or the cloud's scale"
+    ),
+    "openings": (
+        "the openings are {detail} than those of {name} by {value:.1f} mm, at most {limit:g} mm expected: another rack, "
+        "or correct size_mm"
+    ),
+    "outline": (
+        "the outline is {detail} than that of {name} by {value:.1f} mm, at most {limit:g} mm expected: another rack, or "
+        "correct outline_mm"
+    ),
+    "scale": (
+        "everything is {detail} than {name} by {value:.2f}%, at most {limit:g}% expected: the cloud's scale (depth_scale_m, "
+        "calibration) or the rack's file is off"
+    ),
+    "floor": (
+        "the floor of the slots is seen {value:.1f} mm {detail} than {name} says, at most {limit:.1f} mm expected: another "
+        "rack, or correct floor_mm"
+    ),
+    "not_level": (
+        "it stands {value:.1f} deg off the level of the scene, at most {limit:g} deg expected, and little of its top is seen"
+    ),
+    "grid": "{detail}",
+    "two_places": (
+        "two places look like {name} (the better one by a ratio of {value:.2f} in evidence, {limit:g} expected): too little "
+        "of its top is seen"
+    ),
+}
+
+
+def sentence(check: Check, name: str) -> str:
+    """What a check says of a rack or tube of that name."""
+    words = SENTENCES[check.code.replace("column", "row")]
+    return words.format(value=check.value, limit=check.limit, detail=check.detail, name=name)
+
+
+def failed(checks: Iterable[Check]) -> tuple[Check, ...]:
+    """The checks for which an answer is refused."""
+    return tuple(check for check in checks if check.decides and not check.passed)
+
+
+def reason(checks: Iterable[Check], name: str) -> str:
+    """Why an answer is refused, in words; empty if it is not."""
+    found = [sentence(check, name) for check in failed(checks)]
+    more = len(found) - MOST_TOLD
+    return "; ".join(found[:MOST_TOLD]) + (f"; and {more} more like it" if more > 0 else "")
+
+
+def reason_code(checks: Iterable[Check]) -> str:
+    """Code of the first check for which an answer is refused; empty if it is not."""
+    return next((check.code for check in failed(checks)), "")
+
+
+def mark_codes(checks: Iterable[Check]) -> str:
+    """Codes of the checks that mark an answer without refusing it, with semicolons."""
+    return ";".join(dict.fromkeys(check.code for check in checks if not check.decides and not check.passed))

@@ -1,0 +1,177 @@
+"""What a registration has to pass: quick looks first, then named alternatives and sizes on the cells of the face."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from tubepose.checks import Check, failed
+from tubepose.config import RackConfig
+from tubepose.labware import RackModel
+from tubepose.rack.agreement import JUDGED_M, Agreement
+from tubepose.rack.alternatives import SIDES, edge_slots, gains, line_steps_m
+from tubepose.rack.face import Face, face_grid, look_at_face
+from tubepose.rack.field import openings_field
+from tubepose.rack.fit import Fit, to_frame, top_frame
+from tubepose.rack.size import FaceSize, measure_size
+from tubepose.transforms import FloatArray
+
+# Cells beside the outline that are looked at: a line of slots more.
+BESIDE_M = 30e-3
+# Degrees and millimetres, with their part of a covariance.
+_UNITS = (("uncertain_turn", np.rad2deg(1.0), slice(0, 3)), ("uncertain_shift", 1e3, slice(3, 6)))
+# A pose that is known no better than this is not known at all.
+LOST_DEG = 45.0
+# The middle of a place for a tube, as a share of the distance of slots, and the share of it that a tube fills.
+CORE, FULL = 0.3, 0.6
+# A floor is seen in slots with so many points, this near to each other in height, away from walls and from the face.
+FLOOR_POINTS = 12
+FLAT_M = 0.8e-3
+WALL_M = 2.5e-3
+DEEP_M = 6e-3
+# Slots that have to agree on it, and how well the level of one is known.
+FLOOR_SLOTS = 3
+FLOOR_STD_M = 0.3e-3
+
+
+def prove(
+    points_m: FloatArray, fit: Fit, seen: Agreement, rack: RackModel, config: RackConfig
+) -> tuple[tuple[Check, ...], FaceSize | None]:
+    """Every check of a registration, and the sizes of its face; without them where a quick look fails.
+
+    Args:
+        points_m: Points near the rack, camera frame, shape (N, 3), metres; of a bowed rack those that were laid flat.
+        fit: The registration.
+        seen: What a quick look has counted.
+        rack: The rack.
+        config: Limits.
+    """
+    checks = tuple(_quick(seen, fit, config))
+    if failed(checks):
+        return checks, None
+    window_m = float(np.clip(fit.scatter_m, *JUDGED_M))
+    grid = face_grid(rack, seen.spacing_m, BESIDE_M)
+    face = look_at_face(points_m, fit.T_camera_rack, rack, window_m, grid, seen.spacing_m)
+    size = measure_size(face, rack)
+    distance_m = float(np.linalg.norm(top_frame(fit.T_camera_rack, rack)[:3, 3]))
+    checks += (*_alternatives(face, rack, config), *_beside(face, rack), *_sizes(size, rack, config))
+    return (*checks, *_scale(size, rack, distance_m, config), *_floor(points_m, fit, rack, config)), size
+
+
+def _quick(seen: Agreement, fit: Fit, config: RackConfig) -> Iterator[Check]:
+    rmse_mm, limit_mm = 1e3 * seen.rmse_m, 1e3 * config.max_inlier_rmse_m
+    yield Check("inlier_rmse", rmse_mm, limit_mm, not rmse_mm > limit_mm)
+    for code, value, limit in (
+        ("in_openings", seen.in_slot, config.max_stray_share),
+        ("beside_outline", seen.outside, config.max_outside_share),
+    ):
+        yield Check(code, 100 * value, 100 * limit, value <= limit)
+    least = config.min_seen if fit.level is None else config.min_seen_held
+    yield Check("little_seen", 100 * seen.coverage, 100 * least, seen.coverage >= least)
+    yield Check("not_in_view", 100 * seen.unseen, 100 * config.max_unseen_share, seen.unseen <= config.max_unseen_share)
+    yield Check("slot_step", seen.slot_margin, config.min_slot_margin, seen.slot_margin >= config.min_slot_margin)
+    most_mm = config.max_shift_std_mm if fit.level is None else config.max_shift_std_held_mm
+    for (code, scale, part), limit in zip(_UNITS, (config.max_turn_std_deg, most_mm), strict=True):
+        std = float(scale * np.sqrt(np.diag(fit.covariance)[part].max()))
+        if code == "uncertain_turn" and std > LOST_DEG:
+            yield Check("lost", std, limit, False)
+            return
+        yield Check(code, std, limit, std <= limit)
+
+
+def _alternatives(face: Face, rack: RackModel, config: RackConfig) -> Iterator[Check]:
+    for gain in gains(face, rack):
+        worse = gain.nats <= config.max_gain or gain.sigmas <= config.min_gain_sigmas
+        yield Check(gain.code, gain.nats, config.max_gain, worse, detail=gain.words)
+
+
+def _beside(face: Face, rack: RackModel) -> Iterator[Check]:
+    """Tubes that stand where another line of slots would be: full places in more than one slot of it."""
+    xy = face.grid.centers_m
+    steps = line_steps_m(rack)
+    for side, sign in SIDES.items():
+        axis = 0 if sign[0] else 1
+        step = steps[axis]
+        if step is None:
+            continue
+        full = 0
+        for slot in edge_slots(rack.all_slots, np.array(sign) * step):
+            core = np.hypot(*(xy - slot.center_m - np.array(sign) * step).reshape(-1, 2).T) < CORE * step
+            full += bool(core.any()) and float(face.standing.ravel()[core].mean()) > FULL
+        what = "column" if axis == 0 else "row"
+        yield Check("tubes_beside", full, 1, full <= 1, detail=f"a {what} more at {side}")
+
+
+def _sizes(size: FaceSize, rack: RackModel, config: RackConfig) -> Iterator[Check]:
+    std, reach_m = size.std, np.abs(rack.slot_centers_m).max(axis=0)
+    for axis, name in enumerate("xy"):
+        value_mm, std_mm = (1e3 * float(share * reach_m[axis]) for share in (size.stretch[axis], std[axis]))
+        yield from _measured(f"pitch_{name}", value_mm, std_mm, config.max_pitch_mm, ("farther apart", "nearer"))
+    wider_m, wider_std_m = size.wider_openings_m()
+    yield from _measured("openings", 2e3 * wider_m, 2e3 * wider_std_m, config.max_openings_mm, ("wider", "narrower"))
+    for axis in range(2):
+        value_mm, std_mm = (2e3 * float(value) for value in (size.outline_m[axis], std[3 + axis]))
+        yield from _measured("outline", value_mm, std_mm, config.max_outline_mm, ("larger", "smaller"))
+
+
+def _measured(code: str, value: float, std: float, limit: float, words: tuple[str, str]) -> Iterator[Check]:
+    """A check that refuses what is beyond a limit by more than three standard deviations."""
+    beyond = abs(value) - 3 * std
+    yield Check(code, abs(value), limit, beyond <= limit, detail=words[0] if value > 0 else words[1])
+
+
+def _scale(size: FaceSize, rack: RackModel, distance_m: float, config: RackConfig) -> Iterator[Check]:
+    """One scale of pitch and outline, by least squares: a cloud that is too large, or too small.
+
+    An outline's edge is moved by blur as well: its part is as sure as that.
+    """
+    half = rack.outline_m / 2
+    values = np.concatenate([size.stretch, size.outline_m / half])
+    covariance = size.covariance[np.ix_([0, 1, 3, 4], [0, 1, 3, 4])] / np.outer([1, 1, *half], [1, 1, *half])
+    covariance = covariance + np.diag([0, 0, *(config.edge_std_mm * 1e-3 / half) ** 2])
+    weights = np.linalg.solve(covariance, np.ones(4))
+    scale, std = float(weights @ values / weights.sum()), float(weights.sum() ** -0.5)
+    words = "larger" if scale > 0 else "smaller"
+    moved_mm = 1e3 * abs(scale) * distance_m
+    significant = abs(scale) > 3 * std and moved_mm > config.max_scale_shift_mm
+    yield Check("scale", 100 * abs(scale), 0.1 * config.max_scale_shift_mm / distance_m, not significant, False, words)
+    limit = config.max_scale
+    yield Check("scale", 100 * abs(scale), 100 * limit, abs(scale) - 3 * std <= limit, detail=words)
+
+
+def _floor(points_m: FloatArray, fit: Fit, rack: RackModel, config: RackConfig) -> Iterator[Check]:
+    measured = measure_floor(points_m, fit, rack)
+    if measured is None:
+        return
+    off_mm, std_mm = 1e3 * (measured[0] - rack.floor_m), 1e3 * measured[1]
+    limit = config.max_floor_mm + 3 * (std_mm + rack.floor_tolerance_mm)
+    yield Check("floor", abs(off_mm), limit, abs(off_mm) <= limit, detail="higher" if off_mm > 0 else "deeper")
+
+
+def measure_floor(points_m: FloatArray, fit: Fit, rack: RackModel) -> tuple[float, float] | None:
+    """Height of the slots' floor above the rack's base and its standard deviation, metres; None where it is not seen.
+
+    In every slot the points away from its walls whose heights are alike are a floor; the median of the slots that have
+    one is taken, if they agree.
+    """
+    local = to_frame(points_m, top_frame(fit.T_camera_rack, rack))
+    distance, _, known = openings_field(rack).look_up(local)
+    deep = local[known & (local[:, 2] < -DEEP_M) & (distance > WALL_M)]
+    if len(deep) < FLOOR_POINTS:
+        return None
+    apart = deep[:, None, :2] - rack.slot_centers_m[None]
+    slot = np.argmin((apart**2).sum(axis=2), axis=1)
+    levels = []
+    for k in np.unique(slot):
+        z = deep[slot == k, 2]
+        middle = float(np.median(z))
+        if len(z) >= FLOOR_POINTS and np.mean(np.abs(z - middle) < FLAT_M) > 0.75:
+            levels.append(middle)
+    if len(levels) < min(FLOOR_SLOTS, len(rack.all_slots) // 3 + 1):
+        return None
+    level = float(np.median(levels))
+    spread = 1.4826 * float(np.median(np.abs(np.array(levels) - level)))
+    if spread > FLAT_M:
+        return None
+    return rack.height_m + level, float(np.hypot(FLOOR_STD_M, spread) / np.sqrt(len(levels)))
