@@ -50,6 +50,13 @@ def test_shared_error_has_its_std_and_its_correlation(length_m: float) -> None:
     assert np.mean(product) / np.var(fields) == pytest.approx(np.exp(-1), abs=0.05)
 
 
+@pytest.mark.parametrize(("power", "ratio"), [(0.0, 1.0), (1.0, 1.2), (2.0, 1.44)])
+def test_noise_grows_with_its_power_of_depth(power: float, ratio: float) -> None:
+    error = DepthNoise(1e-3, depth_power=power).applied(step(), np.random.default_rng(0)).cloud_m[..., 2]
+    near, far = np.std(error[:, :200] - 0.5), np.std(error[:, 200:] - 0.6)
+    assert far / near == pytest.approx(ratio, rel=0.02)
+
+
 def test_independent_error_is_not_shared() -> None:
     error = error_of(DepthNoise(independent_m=1e-3))
     assert np.std(error) == pytest.approx(1e-3, rel=0.02)

@@ -15,7 +15,7 @@ from tubepose.transforms import FloatArray
 
 @dataclass(frozen=True, slots=True)
 class DepthNoise:
-    """Errors of depth z, the same law at every pixel; points move along their line of sight.
+    """Errors of depth z; points move along their line of sight.
 
     They come in the order of a real sensor: edges are blurred, noise is added, depth is counted in steps, pixels fail.
 
@@ -27,6 +27,8 @@ class DepthNoise:
         blur_px: Depth is averaged over a square window of 1 + blur_px pixels: a step becomes a ramp of that width.
         missing: Share of the measured pixels, drawn one by one, that become invalid; 0 to 1.
         step_m: Depth is rounded to whole multiples of this, metres; 0 leaves it as it is.
+        depth_power: Both standard deviations hold at the frame's median depth and grow with this power of depth: 0 for
+            noise that is the same everywhere, 1 as REAL stereo cameras have it, 2 for a constant error of parallax.
     """
 
     independent_m: float = 0.0
@@ -35,10 +37,12 @@ class DepthNoise:
     blur_px: float = 0.0
     missing: float = 0.0
     step_m: float = 0.0
+    depth_power: float = 0.0
 
     def __post_init__(self) -> None:
         """Refuse values that mean nothing."""
-        found = (self.independent_m, self.shared_m, self.correlation_m, self.blur_px, self.missing, self.step_m)
+        lengths = (self.independent_m, self.shared_m, self.correlation_m, self.step_m)
+        found = (*lengths, self.blur_px, self.missing, self.depth_power)
         if not all(np.isfinite(found)) or min(found) < 0 or self.correlation_m == 0 or self.missing > 1:
             raise ConfigError(
                 f"depth noise: expected numbers of 0 or more, a correlation_m above 0 and a missing of 1 at most, "
@@ -75,10 +79,13 @@ class DepthNoise:
         white = rng.standard_normal(depth_m.shape)
         error = self.independent_m * own
         valid = np.isfinite(depth_m)
-        if self.shared_m > 0 and valid.any():
-            length_px = self.correlation_m * np.sqrt(camera.fx * camera.fy) / float(np.median(depth_m[valid]))
+        if not valid.any():
+            return np.asarray(error)
+        median_m = float(np.median(depth_m[valid]))
+        if self.shared_m > 0:
+            length_px = self.correlation_m * np.sqrt(camera.fx * camera.fy) / median_m
             error = error + self.shared_m * _smooth(white, length_px)
-        return np.asarray(error)
+        return np.asarray(error * (depth_m / median_m) ** self.depth_power)
 
 
 def _smooth(white: FloatArray, length_px: float) -> FloatArray:
