@@ -153,16 +153,3 @@ def prior_noise(config: SensorConfig, note: str = "") -> SensorNoise:
         distance_m=config.distance_m,
         note=note,
     )
-
-
-def describe_noise(noise: SensorNoise) -> str:
-    """The noise in one line, for a person."""
-    words = (
-        f"depth noise: {noise.independent_m * 1e3:.2g} mm independent, {noise.shared_m * 1e3:.2g} mm shared over "
-        f"{noise.correlation_m * 1e3:.2g} mm"
-    )
-    surface = {TABLE: "on the table", RACK_TOP: "on the rack's top"}.get(noise.source)
-    words += f" (measured {surface}, {noise.n_patches} patches)" if surface else " (assumed: not measured)"
-    assumed = " (assumed)" if noise.edge_source == PRIOR else ""
-    note = f"; {noise.note}" if noise.note else ""
-    return f"{words}, edges {noise.edge_blur_px:.1f} px{assumed}{note}"
