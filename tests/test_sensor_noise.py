@@ -226,11 +226,12 @@ def test_things_on_the_table_are_not_noise(lift_m: float) -> None:
     assert found.slope_std(CAP_M, 0.5) == pytest.approx(plain.slope_std(CAP_M, 0.5), rel=0.2)
 
 
-@pytest.mark.parametrize(("blur_px", "least", "most"), [(0, 0, 0), (2, 1.5, 2.5), (4, 3.0, 4.5), (6, 4.0, 6.5)])
-def test_blur_of_edges_is_counted(blur_px: float, least: float, most: float) -> None:
+@pytest.mark.parametrize("blur_px", [0, 2, 4, 6])
+def test_blur_of_edges_is_counted(blur_px: float) -> None:
     found = measure(noisy(DepthNoise(independent_m=5e-5, blur_px=blur_px)))
     assert found.edge_source == "rack_outline"
-    assert least <= found.edge_blur_px <= most
+    # A square window of w pixels is w (1 + t) / (1 + t^2) steps wide across an edge of slope t: up to 1.21 w.
+    assert 0.9 * blur_px <= found.edge_blur_px <= (1.21 * (blur_px + 1) - 1 if blur_px else 0)
 
 
 def test_lost_pixels_at_an_edge_are_not_blur() -> None:

@@ -81,6 +81,25 @@ def off_surface(rows, surface):
 
 
 @compiled
+def surface_sums(rows, off, clip):
+    """Normal equations of a quadratic surface through the distances of points from another one: (6, 6) and (6,)."""
+    matrix, right, terms = np.zeros((6, 6)), np.zeros(6), np.ones(6)
+    for k in range(len(rows)):
+        if abs(off[k]) > clip:
+            continue
+        x, y = rows[k, 0], rows[k, 1]
+        terms[1], terms[2], terms[3], terms[4], terms[5] = x, y, x * x, x * y, y * y
+        for i in range(6):
+            right[i] += terms[i] * off[k]
+            for j in range(i + 1):
+                matrix[i, j] += terms[i] * terms[j]
+    for i in range(6):
+        for j in range(i):
+            matrix[j, i] = matrix[i, j]
+    return matrix, right
+
+
+@compiled
 def disc_sums(rows, off, clip, low, pitch, shape, radius, distance):
     """Sums over discs on a square grid, shape (X, Y, 11), of equal angular size: their radius holds at a distance.
 
