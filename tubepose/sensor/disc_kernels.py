@@ -133,7 +133,7 @@ def disc_sums(rows, off, clip, low, pitch, shape, radius, distance):
 
 
 @compiled
-def cell_sums(rows, off, clip, low, cell, shape, distance):
+def cell_sums(rows, off, clip, low, cell, shape):
     """Number, sum and sum of squares of the distances from the surface, per square cell, shape (X, Y, 3)."""
     sums = np.zeros((shape[0], shape[1], 3))
     for k in range(len(rows)):
@@ -142,8 +142,23 @@ def cell_sums(rows, off, clip, low, cell, shape, distance):
         i, j = math.floor((rows[k, 0] - low[0]) / cell), math.floor((rows[k, 1] - low[1]) / cell)
         if i < 0 or j < 0 or i >= shape[0] or j >= shape[1]:
             continue
-        row, h = sums[i, j], off[k] * distance / rows[k, 3]
+        row, h = sums[i, j], off[k]
         row[0] += 1.0
         row[1] += h
         row[2] += h * h
     return sums
+
+
+@compiled
+def off_cells(rows, off, clip, low, cell, sums):
+    """Distance (N,) of points from the mean of their cell, each as a free one has it; 0 of a lone point, NaN off it."""
+    left = np.full(len(rows), np.nan)
+    for k in range(len(rows)):
+        if abs(off[k]) > clip:
+            continue
+        i, j = math.floor((rows[k, 0] - low[0]) / cell), math.floor((rows[k, 1] - low[1]) / cell)
+        n = sums[i, j, 0]
+        left[k] = 0.0
+        if n > 1.0:
+            left[k] = (off[k] - sums[i, j, 1] / n) * math.sqrt(n / (n - 1.0))
+    return left

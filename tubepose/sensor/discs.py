@@ -42,7 +42,7 @@ def measure_discs(surface: LevelSurface, config: SensorConfig) -> tuple[tuple[Di
         n_values = 2 * len(sums)
         # Winsorised mean squares are 0.9 times as efficient as plain ones; of heights there are half as many.
         known = 1 / np.sqrt(2 * 0.9 * n_values)
-        found.append(DiscNoise(radius, _spread(slopes), _spread(heights), len(sums), float(known)))
+        found.append(DiscNoise(radius, spread(slopes), spread(heights), len(sums), float(known)))
         if len(sums) > most:
             most = len(sums)
             area_m2 = float(np.pi * radius**2 / np.median(sums[:, 0]))
@@ -52,10 +52,10 @@ def measure_discs(surface: LevelSurface, config: SensorConfig) -> tuple[tuple[Di
 
 def _laid(surface: LevelSurface, radius_m: float, config: SensorConfig) -> FloatArray:
     """Sums of the discs of one radius, shape (D, 11), on a grid that is wide enough for no more than are wanted."""
-    low, high, farthest_m = kernels.extent(surface.rows)
-    size = high - low
+    low = surface.low_m
+    size = surface.high_m - low
     # Discs of equal pixels are larger where the surface is farther.
-    least = 2 * radius_m * farthest_m / surface.distance_m
+    least = 2 * radius_m * surface.farthest_m / surface.distance_m
     seen_m2 = float(np.prod(size))
     pitch = max(least, float(np.sqrt(seen_m2 / (2 * config.discs))))
     shape = np.maximum(np.floor(size / pitch), 1).astype(int)
@@ -88,8 +88,14 @@ def _planes(sums: FloatArray) -> tuple[FloatArray, FloatArray]:
     return planes[:, 1:].ravel(), h / n
 
 
-def _spread(values: FloatArray) -> float:
-    """Standard deviation about zero from winsorised mean squares: medians read 0 on depth that comes in steps."""
+def spread(values: FloatArray) -> float:
+    """Standard deviation about zero from winsorised mean squares: medians read 0 on depth that comes in steps.
+
+    Args:
+        values: Numbers, shape (N,); without any it is 0.
+    """
     size: NDArray[np.float64] = np.abs(values)
+    if not len(size):
+        return 0.0
     bound = np.quantile(size, WINSOR_SHARE)
     return float(np.sqrt(np.mean(np.minimum(size, bound) ** 2) / WINSOR_GAIN))

@@ -47,7 +47,10 @@ class LevelSurface:
         clip_m: Points farther off than this are not of the surface.
         surface: Coefficients of z = c0 + c1 x + c2 y + c3 x x + c4 x y + c5 y y, rack frame, shape (6,); the quadratic
             ones are 0 unless they are significant.
+        low_m: Least x and y of the points, shape (2,), metres.
+        high_m: Greatest x and y of the points, shape (2,), metres.
         distance_m: Median depth.
+        farthest_m: Greatest depth.
         std_m: Standard deviation of the points of the surface about it.
     """
 
@@ -55,7 +58,10 @@ class LevelSurface:
     off_m: FloatArray
     clip_m: float
     surface: FloatArray
+    low_m: FloatArray
+    high_m: FloatArray
     distance_m: float
+    farthest_m: float
     std_m: float
 
     def height_m(self, xy_m: FloatArray) -> FloatArray:
@@ -173,7 +179,8 @@ def _fitted(rows: FloatArray, thin: FloatArray, config: SensorConfig) -> LevelSu
     if np.count_nonzero(near) < config.least_points:
         return None
     std, distance = float(np.sqrt(np.mean(off[near] ** 2))), float(np.median(thin[:, 3]))
-    return LevelSurface(rows, off, clip, surface, distance, std)
+    low, high, farthest = kernels.extent(rows)
+    return LevelSurface(rows, off, clip, surface, low, high, distance, farthest, std)
 
 
 def _left_over(rows: FloatArray, off_m: FloatArray, clip_m: float, n_terms: int) -> FloatArray:
