@@ -74,7 +74,7 @@ def estimate(
 ) -> None:
     """Estimate the pose of the rack and of every tube in recorded captures.
 
-    Writes racks.csv, slots.csv, estimates.csv, timings.csv, run.json and overlays/ into --out.
+    Writes racks.csv, sensor.csv, slots.csv, estimates.csv, timings.csv, run.json and overlays/ into --out.
     """
     from tubepose.capture.session import SESSION_FILE, is_session
     from tubepose.config import load_config

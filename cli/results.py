@@ -39,10 +39,10 @@ def run_estimates(
     problems: Sequence[str] = (),
     **more: Any,
 ) -> Tables:
-    """Run jobs and write racks.csv, slots.csv, estimates.csv, timings.csv, run.json and overlays/ into `out`.
+    """Run jobs and write their four tables, sensor.csv, run.json and overlays/ into `out`, and say how noisy they are.
 
-    `problems` are those from before, and `labware` what was used besides, for the record. `JUDGED_FILES` of an earlier
-    run are removed.
+    The tables are racks.csv, slots.csv, estimates.csv and timings.csv. `problems` are those from before, and `labware`
+    what was used besides, for the record. `JUDGED_FILES` of an earlier run are removed.
 
     Raises:
         StoppedError: The user stopped the run. What was done by then is written; nothing where nothing was done.
@@ -50,9 +50,9 @@ def run_estimates(
     from tubepose.batch import Tables, run_jobs
     from tubepose.errors import StoppedError
     from tubepose.provenance import inputs_sha256, pinned_threads, run_record
-    from tubepose.records import ESTIMATE_COLUMNS, RACK_COLUMNS, SLOT_COLUMNS, TIMING_COLUMNS, to_table
+    from tubepose.records import ESTIMATE_COLUMNS, RACK_COLUMNS, SENSOR_COLUMNS, SLOT_COLUMNS, TIMING_COLUMNS, to_table
     from tubepose.report.writing import make_folder, remove_files, write_csv, write_json
-    from tubepose_cli.show import progress, say_when_compiling
+    from tubepose_cli.show import describe_noise, progress, say, say_when_compiling
 
     taken: dict[str, tuple[str, ...]] = {}
 
@@ -76,6 +76,7 @@ def run_estimates(
             raise StoppedError(f"{stopped}; no estimate is written to {out}") from None
     remove_files(out, JUDGED_FILES)
     write_csv(out / "racks.csv", to_table(tables.racks, RACK_COLUMNS))
+    write_csv(out / "sensor.csv", to_table(tables.sensor, SENSOR_COLUMNS))
     write_csv(out / "slots.csv", to_table(tables.slots, SLOT_COLUMNS))
     write_csv(out / "estimates.csv", to_table(tables.estimates, ESTIMATE_COLUMNS))
     write_csv(out / "timings.csv", to_table(tables.timings, TIMING_COLUMNS))
@@ -91,6 +92,8 @@ def run_estimates(
         **more,
     )
     write_json(out / "run.json", record)
+    if tables.sensor:
+        say(describe_noise(tables.sensor))
     if stopped:
         raise StoppedError(f"{stopped}, and in the tables in {out}")
     return tables

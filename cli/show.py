@@ -76,6 +76,30 @@ def say(text: str) -> None:
     typer.echo(one_line(text), err=True)
 
 
+def describe_noise(rows: Sequence[Mapping[str, Any]]) -> str:
+    """The sensor's noise in one line, from rows of sensor.csv: medians over the frames in which it was measured."""
+    from statistics import median
+
+    surfaces = {"table": "on the table", "rack_top": "on the rack's top"}
+    measured = [row for row in rows if row["source"] in surfaces]
+    edges = [row for row in rows if row["edge_source"] != "prior"]
+
+    def middle(name: str, of: Sequence[Mapping[str, Any]]) -> float:
+        return median(float(row[name]) for row in of or rows)
+
+    where = "assumed, not measured"
+    if measured:
+        found = sorted({row["source"] for row in measured}, key=list(surfaces).index)
+        frames = f" in {len(measured)} of {len(rows)} frames" if len(rows) > 1 else ""
+        places = " or ".join(surfaces[name] for name in found)
+        where = f"measured {places}{frames}, {middle('n_patches', measured):.0f} patches"
+    values = [middle(name, measured) * 1e3 for name in ("independent_m", "shared_m", "correlation_m")]
+    text = "depth noise: {:.2g} mm independent, {:.2g} mm shared over {:.2g} mm".format(*values)
+    assumed = "" if edges else " (assumed)"
+    notes = list(dict.fromkeys(str(row["note"]) for row in measured if row["note"]))
+    return "; ".join([f"{text} ({where}), edges {middle('edge_blur_px', edges):.1f} px{assumed}", *notes[:1]])
+
+
 def say_when_compiling() -> None:
     """One line before loops are compiled: it takes a while, and the machine code is kept."""
     from tubepose.compiled import before_compiling

@@ -20,7 +20,7 @@ from tubepose.detection.geometric import GeometricDetector
 from tubepose.errors import CaptureError, DetectorError
 from tubepose.labware import load_rack, load_tube
 from tubepose.rack import RackPose, RackStatus
-from tubepose.records import ESTIMATE_COLUMNS, RACK_COLUMNS, SLOT_COLUMNS, TIMING_COLUMNS, to_table
+from tubepose.records import ESTIMATE_COLUMNS, RACK_COLUMNS, SENSOR_COLUMNS, SLOT_COLUMNS, TIMING_COLUMNS, to_table
 from tubepose.transforms import transform_points
 
 CONFIG = Config()
@@ -168,7 +168,7 @@ def test_warm_up_runs_the_first_frame_once_more_and_marks_its_times_only() -> No
     cold, warm = (run(job("good", GOOD), job("good", GOOD), warm_up=wanted) for wanted in (False, True))
     assert (len(warm.racks), len(warm.estimates)) == (len(cold.racks), len(cold.estimates)) == (2, 2)
     marked = [row["stage"] for row in warm.timings if row["warmup"]]
-    assert marked == ["detect", "rack", "slots", "tube"]
+    assert marked == ["detect", "rack", "sensor", "slots", "tube"]
     assert [row["stage"] for row in warm.timings if not row["warmup"]] == ["load", *marked] * 2
     assert not any(row["warmup"] for row in cold.timings)
 
@@ -212,6 +212,7 @@ def test_the_rows_fit_the_columns() -> None:
     tables = run(job("good", GOOD), methods=("paper",))
     for rows, columns in (
         (tables.racks, RACK_COLUMNS),
+        (tables.sensor, SENSOR_COLUMNS),
         (tables.slots, SLOT_COLUMNS),
         (tables.estimates, ESTIMATE_COLUMNS),
         (tables.timings, TIMING_COLUMNS),

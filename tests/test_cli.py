@@ -34,6 +34,7 @@ from tubepose.records import (
     POSE_COLUMNS,
     RACK_COLUMNS,
     RACK_COVARIANCE_COLUMNS,
+    SENSOR_COLUMNS,
     SLOT_COLUMNS,
     TIMING_COLUMNS,
 )
@@ -105,7 +106,7 @@ def test_estimate_writes_these_files_and_no_others(estimated: tuple[Path, Ended]
     session = table(out / "racks.csv")["session"][0]
     pictures = {f"{session}-{tube}-001-original-0000.png" for tube in SMALL_TUBES}
     assert {path.name for path in (out / "overlays").iterdir()} == pictures
-    files = {"racks.csv", "slots.csv", "estimates.csv", "timings.csv", "run.json", "overlays"}
+    files = {"racks.csv", "sensor.csv", "slots.csv", "estimates.csv", "timings.csv", "run.json", "overlays"}
     assert {path.name for path in out.iterdir()} == files
     assert {path.name for path in out.parent.iterdir()} == {"out"}
 
@@ -113,6 +114,7 @@ def test_estimate_writes_these_files_and_no_others(estimated: tuple[Path, Ended]
 def test_estimate_writes_exactly_these_columns(estimated: tuple[Path, Ended]) -> None:
     out, _ = estimated
     assert columns(out / "racks.csv") == list(RACK_COLUMNS)
+    assert columns(out / "sensor.csv") == list(SENSOR_COLUMNS)
     assert columns(out / "slots.csv") == list(SLOT_COLUMNS)
     assert columns(out / "estimates.csv") == list(ESTIMATE_COLUMNS)
     assert columns(out / "timings.csv") == list(TIMING_COLUMNS)
@@ -192,7 +194,9 @@ def test_bench_prints_both_tables_on_stdout_and_talks_on_stderr(benched: tuple[P
     assert ended.out.index("Rotational and translational errors") < ended.out.index("Time costs")
     assert "SIMULATED" in ended.out
     assert "[Open3D" not in ended.out + ended.err
-    assert ended.err.splitlines() == [f"all tables and rows: {out}"]
+    noise, last = ended.err.splitlines()
+    assert noise.startswith("depth noise: ")
+    assert last == f"all tables and rows: {out}"
     assert not [name for name in digests(out) if "/." in f"/{name}"]
     for name in ("table_accuracy", "table_timing"):
         assert r"\end{table}" in (out / f"{name}.tex").read_text()
@@ -239,7 +243,7 @@ def documented(name: str) -> set[str]:
 @pytest.mark.parametrize(
     "name",
     [
-        "racks", "slots", "estimates", "timings", "ground_truth", "errors", "summary", "comparison", "seeds",
+        "racks", "sensor", "slots", "estimates", "timings", "ground_truth", "errors", "summary", "comparison", "seeds",
         "slot_accuracy", "uncertainty", "coverage", "confusion",
     ],
 )  # fmt: skip

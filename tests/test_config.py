@@ -26,7 +26,7 @@ def test_a_file_changes_what_it_names_and_nothing_else(tmp_path):
 
 
 def test_unknown_section_names_the_known_ones(tmp_path):
-    with pytest.raises(ConfigError, match=r"unknown key 'tubes'; known keys: .*rack_top, rack, slots, tube, .*rivals"):
+    with pytest.raises(ConfigError, match=r"unknown key 'tubes'; known keys: .*rack, sensor, slots, tube, .*rivals"):
         load_config(written(tmp_path, "tubes: {}\n"))
 
 

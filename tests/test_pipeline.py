@@ -117,7 +117,7 @@ def test_every_method_answers_for_every_target_once(scene, method):
 
 
 def test_the_shared_stages_are_timed_in_the_papers_order(scene):
-    assert [time.stage for time in scene.times] == ["detect", "rack", "slots"]
+    assert [time.stage for time in scene.times] == ["detect", "rack", "sensor", "slots"]
     assert {time.method for time in scene.times} == {"all"}
 
 
@@ -177,6 +177,7 @@ def test_without_a_rack_nothing_is_invented():
     assert found.targets == ()
     assert estimate_tubes(found, "paper", CONFIG) == ((), ())
     assert [time.stage for time in found.times] == ["detect", "rack"]
+    assert (found.noise.source, found.noise.note) == ("prior", "the rack's pose is not known")
 
 
 def test_the_rack_with_the_best_score_is_taken():
@@ -268,7 +269,7 @@ def seen():
 
 def test_profile_needs_neither_boxes_nor_the_slots_of_others(seen):
     assert seen.targets == ()
-    assert [time.stage for time in seen.times] == ["detect"]
+    assert [time.stage for time in seen.times] == ["detect", "sensor"]
     estimates, times = estimate_tubes(seen, "profile", CONFIG)
     assert {e.target.slot: e.target.tube for e in estimates} == {slot: tube for slot, (tube, _) in PLACED.items()}
     assert {(e.method, e.seed, e.target.detection, e.target.reason) for e in estimates} == {("profile", None, None, "")}

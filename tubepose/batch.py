@@ -21,7 +21,7 @@ from tubepose.errors import CaptureError, TubePoseError, is_interrupt, kept
 from tubepose.labware import Labware, RackModel, TubeModel
 from tubepose.pipeline import DEFAULT_METHOD, STOCHASTIC, Scene, StageTime, TubeEstimate, estimate_tubes, prepare_scene
 from tubepose.rack import RackPose, RackStatus
-from tubepose.records import Row, estimate_row, rack_pose_row, rack_row, slot_rows, timing_row
+from tubepose.records import Row, estimate_row, rack_pose_row, rack_row, sensor_row, slot_rows, timing_row
 from tubepose.transforms import FloatArray
 
 DetectorFactory = Callable[[RackModel, tuple[TubeModel, ...]], Detector]
@@ -89,6 +89,7 @@ class Tables:
 
     Attributes:
         racks: One per frame and method.
+        sensor: One per frame.
         slots: One per frame, method and slot.
         estimates: One per frame, method, seed and detected tube.
         timings: One per timed stage instance.
@@ -98,6 +99,7 @@ class Tables:
     """
 
     racks: list[Row] = field(default_factory=list)
+    sensor: list[Row] = field(default_factory=list)
     slots: list[Row] = field(default_factory=list)
     estimates: list[Row] = field(default_factory=list)
     timings: list[Row] = field(default_factory=list)
@@ -107,12 +109,15 @@ class Tables:
 
     def lengths(self) -> tuple[int, ...]:
         """How many rows there are, table by table."""
-        return tuple(len(rows) for rows in (self.racks, self.slots, self.estimates, self.timings))
+        return tuple(len(rows) for rows in self._rows())
 
     def cut(self, lengths: tuple[int, ...]) -> None:
         """Leave out the rows that came after there were so many."""
-        for rows, length in zip((self.racks, self.slots, self.estimates, self.timings), lengths, strict=True):
+        for rows, length in zip(self._rows(), lengths, strict=True):
             del rows[length:]
+
+    def _rows(self) -> tuple[list[Row], ...]:
+        return self.racks, self.sensor, self.slots, self.estimates, self.timings
 
 
 def session_jobs(session: Session, *, fail_fast: bool = False) -> tuple[list[Job], list[str]]:
@@ -284,6 +289,7 @@ def _run_frame(
     tables.labware[job.rack.name] = job.rack
     tables.labware |= {tube.name: tube for tube in job.tubes}
     keys = _keys(job, frame)
+    tables.sensor.append(sensor_row(keys, frame, scene.noise))
     times = ([load] if load is not None else []) + list(scene.times)
     shown_method = DEFAULT_METHOD if DEFAULT_METHOD in methods else methods[0]
     shown: tuple[TubeEstimate, ...] = ()

@@ -19,6 +19,7 @@ from tubepose.profile import ProfileTube, fit_profiles
 from tubepose.rack import RackPose, RackStatus, register_rack
 from tubepose.rivals import fit_gicp, fit_kiss_matcher
 from tubepose.scene import Scene, TubeEstimate, TubeTarget
+from tubepose.sensor import measure_noise, prior_noise
 from tubepose.stage_times import Clock, StageTime
 from tubepose.targets import allowed_types, boxes_alone, find_targets
 from tubepose.transforms import FloatArray
@@ -51,7 +52,7 @@ def prepare_scene(
     T_camera_rack: FloatArray | None = None,
     methods: Sequence[str] = tuple(TUBE_METHODS),
 ) -> Scene:
-    """Detect, register the rack, and find the slot and the type of every detected tube.
+    """Detect, register the rack, measure the sensor's noise, and find the slot and the type of every detected tube.
 
     Args:
         frame: The frame.
@@ -88,6 +89,10 @@ def prepare_scene(
             # Where that fails too, the first answer stays.
             if other_pose.T_camera_rack is not None:
                 detections, rack_pose = others, other_pose
+    noise = prior_noise(config.sensor, "the rack's pose is not known")
+    if rack_pose.T_camera_rack is not None:
+        with clock.stage("sensor"):
+            noise = measure_noise(frame, intrinsics, rack_pose.T_camera_rack, rack, config.sensor)
     targets: tuple[TubeTarget, ...] = ()
     if rack_pose.T_camera_rack is not None and any(method in TUBE_METHODS for method in methods):
         if isinstance(detector, AssistedDetector):
@@ -95,7 +100,7 @@ def prepare_scene(
                 detections = detector.checked(frame, rack_pose.T_camera_rack, detections)
         with clock.stage("slots"):
             targets = find_targets(frame, rack, tubes, detections, rack_pose.T_camera_rack, config)
-    return Scene(frame, rack, tuple(tubes), intrinsics, detections, rack_pose, targets, clock.shared())
+    return Scene(frame, rack, tuple(tubes), intrinsics, detections, rack_pose, noise, targets, clock.shared())
 
 
 def estimate_tubes(

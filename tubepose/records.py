@@ -12,6 +12,7 @@ from tubepose.capture.frame import RgbdFrame
 from tubepose.pipeline import Scene, StageTime, TubeEstimate, best_rack
 from tubepose.pose_errors import COVARIANCE_COLUMNS, upper_half
 from tubepose.rack import RackPose
+from tubepose.sensor import SensorNoise
 from tubepose.slots import covered_slots
 from tubepose.transforms import FloatArray, quaternion_wxyz, tilt_rad
 
@@ -27,6 +28,14 @@ RACK_COLUMNS = (
     "level_tops", "n_racks_detected", "n_tubes_detected", "box_source", "box_score", "box_note", *POSE_COLUMNS,
     "named_by_margin", *RACK_COVARIANCE_COLUMNS,
 )  # fmt: skip
+SENSOR_COLUMNS = (
+    "session", "trial", "capture", "frame", "timestamp_ns", "source", "independent_m", "independent_relative_std",
+    "shared_m", "shared_relative_std", "correlation_m", "spacing_m", "distance_m", "n_patches", "cap_radius_m",
+    "cap_slope_std", "cap_height_std_m", "outlier_source", "outlier_share", "edge_source", "edge_blur_px",
+    "edge_std_px", "note",
+)  # fmt: skip
+CAP_RADIUS_M = 6.5e-3
+"""Radius of the discs that sensor.csv speaks of: a cap of a 13 mm tube."""
 SLOT_COLUMNS = (
     "session",
     "trial",
@@ -107,6 +116,18 @@ def rack_pose_row(frame: RgbdFrame, pose: RackPose) -> Row:
         "level_tops": pose.level_tops,
         **pose_columns(pose.T_camera_rack),
         **covariance_columns(pose.covariance, RACK_COVARIANCE_COLUMNS),
+    }
+
+
+def sensor_row(keys: Row, frame: RgbdFrame, noise: SensorNoise) -> Row:
+    """Row of sensor.csv."""
+    return {
+        **keys,
+        "timestamp_ns": frame.timestamp_ns,
+        **{name: getattr(noise, name) for name in SENSOR_COLUMNS if hasattr(noise, name)},
+        "cap_radius_m": CAP_RADIUS_M,
+        "cap_slope_std": noise.slope_std(CAP_RADIUS_M, noise.distance_m),
+        "cap_height_std_m": noise.height_std_m(CAP_RADIUS_M, noise.distance_m),
     }
 
 

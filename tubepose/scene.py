@@ -8,6 +8,7 @@ from tubepose.capture.frame import CameraIntrinsics, RgbdFrame
 from tubepose.detection import Detection
 from tubepose.labware import RackModel, TubeModel
 from tubepose.rack import RackPose
+from tubepose.sensor import SensorNoise
 from tubepose.stage_times import StageTime
 from tubepose.transforms import FloatArray
 from tubepose.tube import TubePose
@@ -36,7 +37,7 @@ class TubeTarget:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Scene:
-    """What all methods share of one frame: boxes, rack, slots.
+    """What all methods share of one frame: boxes, rack, noise, slots.
 
     Attributes:
         frame: The frame.
@@ -45,6 +46,7 @@ class Scene:
         intrinsics: Recorded or, for an organised cloud, estimated from it; None where there are none.
         detections: All boxes.
         rack_pose: The rack's pose, or why there is none.
+        noise: The sensor's noise, measured in this frame; the prior without the rack's pose.
         targets: Every detected tube (empty without a rack's pose).
         times: Duration of the shared stages.
     """
@@ -55,6 +57,7 @@ class Scene:
     intrinsics: CameraIntrinsics | None
     detections: tuple[Detection, ...]
     rack_pose: RackPose
+    noise: SensorNoise
     targets: tuple[TubeTarget, ...]
     times: tuple[StageTime, ...]
 

@@ -13,7 +13,7 @@ class StageTime:
     """How long one instance of a stage took.
 
     Attributes:
-        stage: ``load``, ``detect``, ``rack``, ``slots`` or ``tube``.
+        stage: ``load``, ``detect``, ``rack``, ``sensor``, ``slots`` or ``tube``.
         method: The tube method, or ``all`` for a stage that every method shares.
         instance: The slot for a tube, else empty.
         seed: Seed of a stochastic method, else None.
