@@ -72,7 +72,10 @@ def _bases() -> Iterator[Path]:
         yield Path(os.environ.get("XDG_CACHE_HOME") or Path("~/.cache").expanduser()) / "tubepose"
 
 
-SOURCES = (Path(__file__), *_HERE.glob("profile/*kernels.py"), *_HERE.glob("rack/*kernels.py"))
+SOURCES = (
+    Path(__file__),
+    *(path for part in ("profile", "rack", "slots") for path in _HERE.glob(f"{part}/*kernels.py")),
+)
 """The files of all loops over points."""
 compiled = compiler(SOURCES, error_model="numpy")
 """For the loops over points; a division by zero is infinity, as in NumPy."""

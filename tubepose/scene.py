@@ -8,6 +8,7 @@ from tubepose.capture.frame import CameraIntrinsics, RgbdFrame
 from tubepose.detection import Detection
 from tubepose.labware import RackModel, TubeModel
 from tubepose.rack import RackPose
+from tubepose.slots import SlotLook
 from tubepose.stage_times import StageTime
 from tubepose.transforms import FloatArray
 from tubepose.tube import TubePose
@@ -47,6 +48,7 @@ class Scene:
         rack_pose: The rack's pose, or why there is none.
         targets: Every detected tube (empty without a rack's pose).
         times: Duration of the shared stages.
+        looks: What was seen of every slot, in the order of the rack's slots (empty without a rack's pose).
     """
 
     frame: RgbdFrame
@@ -57,6 +59,7 @@ class Scene:
     rack_pose: RackPose
     targets: tuple[TubeTarget, ...]
     times: tuple[StageTime, ...]
+    looks: tuple[SlotLook, ...] = ()
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -49,26 +49,6 @@ class OpeningCells:
     center_m: FloatArray
     slot: NDArray[np.intp]
 
-    def place_at(self, xy_m: FloatArray) -> tuple[NDArray[np.intp], NDArray[np.bool_]]:
-        """Flat number of the grid place of points (N, 2), rack frame, metres, and which points are on the grid."""
-        shape = np.array(self.cell.shape)
-        place = np.floor((xy_m - self.low_m) / self.cell_m)
-        inside = (place >= 0).all(axis=1) & (place < shape).all(axis=1)
-        x, y = np.where(inside[:, None], place, 0).astype(np.intp).T
-        return x * shape[1] + y, inside
-
-    def cell_at(self, xy_m: FloatArray) -> NDArray[np.intp]:
-        """Cell of places (N, 2), rack frame, metres; -1 in no opening."""
-        return self._at(self.cell, xy_m)
-
-    def owner_at(self, xy_m: FloatArray) -> NDArray[np.intp]:
-        """Index of the slot whose column places (N, 2), rack frame, metres, are in; -1 in none."""
-        return self._at(self.owner, xy_m)
-
-    def _at(self, grid: NDArray[np.intp], xy_m: FloatArray) -> NDArray[np.intp]:
-        place, inside = self.place_at(xy_m)
-        return np.where(inside, grid.ravel()[place], -1)
-
 
 @lru_cache(maxsize=16)
 def opening_cells(rack: RackModel, cell_m: float) -> OpeningCells:
@@ -135,6 +115,12 @@ def core_radius_m(rack: RackModel, tubes: Sequence[TubeModel]) -> tuple[FloatArr
     body = np.minimum(min(bodies), widths) if bodies else SLENDER * widths
     off = diagonal * (widths - body) / 2
     return np.maximum(body / 2 - off, LEAST_CORE * widths), 2 * off / rack.depth_m
+
+
+def core_cells(cells: OpeningCells, rack: RackModel, tubes: Sequence[TubeModel]) -> NDArray[np.bool_]:
+    """Cells of the slots' cores at the face (`core_radius_m`), shape (C,)."""
+    radius, _ = core_radius_m(rack, tubes)
+    return np.asarray(np.hypot(*(cells.center_m - rack.slot_centers_m[cells.slot]).T) < radius[cells.slot])
 
 
 def telling_cells(

@@ -4,26 +4,25 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from tubepose.capture.frame import CameraIntrinsics, RgbdFrame
 from tubepose.labware import RackModel, TubeModel
-from tubepose.slots.cells import OpeningCells, core_radius_m, empty_height_m, opening_cells, telling_cells
-from tubepose.slots.lines_of_sight import LinesOfSight, lines_of_sight
+from tubepose.slots.cells import core_cells, telling_cells
+from tubepose.slots.lines_of_sight import follow_sight
+from tubepose.slots.sight_kernels import AT_FACE, FILLED, KINDS, PASSED, SILENT, STANDING
 from tubepose.slots.silhouette import contradicting_m2
 from tubepose.transforms import FloatArray
 
 DEPTH_STD_M = 5.0e-4
 """Prior standard deviation of a point's depth where none was measured, metres: between a structured light scanner
 (0.1 mm) and a stereo or time-of-flight camera at half a metre (1 mm)."""
-BOW_M = 2.5e-3
-"""How far a rack's face may bow off its plane, metres: real plastic racks."""
 PATCH_M = 3.0e-3
 """Side of a patch of lines of sight that count as one, metres: neighbours share their error, an edge, a ghost. The
 range over which real scanners' depth errors were measured to be shared."""
-PASSED, STANDING, FILLED, AT_FACE, HIDDEN, SILENT = range(6)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -83,109 +82,27 @@ def look_at_slots(
     Returns:
         One for each of `rack.all_slots`, in their order. Of a camera below the rack's face: nothing seen.
     """
-    lines = lines_of_sight(frame, intrinsics, T_camera_rack, rack)
-    cells = opening_cells(rack, lines.cell_m)
+    lines = follow_sight(frame, intrinsics, T_camera_rack, rack, depth_std_m)
     n_slots = len(rack.all_slots)
-    if lines.camera_m[2] <= rack.height_m:
-        return _looks(rack, np.zeros((n_slots, 6)), np.zeros(n_slots), np.zeros(n_slots), np.zeros((n_slots, 2)))
-    area = np.maximum(np.bincount(cells.slot, minlength=n_slots), 1)
-    kinds, passing = _followed(lines, cells, rack, depth_std_m)
-    shares = np.column_stack([np.bincount(cells.slot, kinds[:, k], n_slots) for k in range(6)]) / area[:, None]
-    telling = telling_cells(cells, rack, tubes, lines.camera_m)
-    covered, core = _covered(lines, cells, rack, tubes, depth_std_m)
-    stopped = np.bincount(cells.slot, telling * (kinds[:, STANDING] + kinds[:, FILLED]), n_slots)
-    patches_m2 = np.column_stack(
-        [
-            contradicting_m2(passing, cells, rack, tubes, lines.camera_m),
-            np.maximum(stopped, covered * core) * cells.cell_m**2,
-        ]
-    )
-    in_image = np.ones(len(cells.slot))
-    if intrinsics is not None and frame.organised:
-        in_image = _inside_image(cells, rack, intrinsics, T_camera_rack)
-    framed = np.bincount(cells.slot, in_image, n_slots) / area
-    return _looks(rack, shares, framed, covered, patches_m2 / PATCH_M**2)
+    if lines is None:
+        return tuple(SlotLook(slot.name, *[0.0] * 11) for slot in rack.all_slots)
+    cells, kinds = lines.cells, lines.kinds
 
+    def per_slot(values: NDArray[Any]) -> FloatArray:
+        return np.asarray(np.bincount(cells.slot, values, n_slots), float)
 
-def _looks(
-    rack: RackModel, shares: FloatArray, in_image: FloatArray, covered: FloatArray, patches: FloatArray
-) -> tuple[SlotLook, ...]:
+    area = np.maximum(per_slot(np.ones(len(cells.slot))), 1)
+    shares = np.column_stack([per_slot(kinds[:, k]) for k in range(KINDS)]) / area[:, None]
+    in_image = per_slot(lines.in_image) / area
+    # Inside the image, a cell without a line of sight is silent, too.
+    shares[:, SILENT] = np.maximum(in_image - shares[:, :SILENT].sum(axis=1), 0.0)
+    core = core_cells(cells, rack, tubes)
+    covered = per_slot(core & lines.covered)
+    stops = kinds[:, STANDING] + kinds[:, FILLED]
+    stopped = np.maximum(per_slot(telling_cells(cells, rack, tubes, lines.camera_m) * stops), covered)
+    passed_m2 = contradicting_m2(lines.passing, cells, rack, tubes, lines.camera_m)
+    covered = covered / np.maximum(per_slot(core), 1)
     seen = np.maximum(shares[:, [PASSED, STANDING, FILLED, AT_FACE]].sum(axis=1), covered)
-    # Cells without a line of sight inside the image are silent, too.
-    silent = np.maximum(in_image - shares[:, :SILENT].sum(axis=1), 0.0)
-    found = []
-    for i, slot in enumerate(rack.all_slots):
-        passed, standing, filled, at_face, hidden, _ = shares[i].tolist()
-        values = (float(in_image[i]), passed, standing, filled, at_face, hidden, float(silent[i]), float(covered[i]))
-        found.append(SlotLook(slot.name, *values, float(seen[i]), float(patches[i, 0]), float(patches[i, 1])))
-    return tuple(found)
-
-
-def _followed(
-    lines: LinesOfSight, cells: OpeningCells, rack: RackModel, depth_std_m: float
-) -> tuple[FloatArray, FloatArray]:
-    """Share of every opening's cell's lines per kind, (C, 6); of every grid place's lines that went on, (X, Y).
-
-    A line goes on where it ends at the face or below it: on a rib, in a slot as an empty one returns it, on the table.
-    """
-    crosses = np.flatnonzero(np.isfinite(lines.crossing_m[:, 0]))
-    place, inside = cells.place_at(lines.crossing_m[crosses])
-    place, ends = place[inside], lines.end_m[crosses[inside]]
-    cell = cells.cell.ravel()[place]
-    in_slot = cell >= 0
-    kind = _kinds(ends[in_slot], cell[in_slot], cells, rack, lines.camera_m, depth_std_m)
-    count = np.bincount(cell[in_slot] * 6 + kind, minlength=6 * len(cells.slot)).reshape(-1, 6)
-    with np.errstate(invalid="ignore"):
-        went_on = ends[:, 2] < rack.height_m + BOW_M + 3 * depth_std_m
-    went_on[in_slot] = kind == PASSED
-    size = cells.cell.size
-    passing = np.bincount(place, went_on, size) / np.maximum(np.bincount(place, minlength=size), 1)
-    return count / np.maximum(count.sum(axis=1, keepdims=True), 1), passing.reshape(cells.cell.shape)
-
-
-def _kinds(
-    end_m: FloatArray,
-    cell: NDArray[np.intp],
-    cells: OpeningCells,
-    rack: RackModel,
-    camera_m: FloatArray,
-    depth_std_m: float,
-) -> NDArray[np.intp]:
-    """What became of lines of sight through cells, shape (N,)."""
-    band = BOW_M + 3 * depth_std_m
-    slack = band + 2 * rack.floor_tolerance_mm * 1e-3
-    empty = empty_height_m(cells, rack, camera_m)[cell]
-    z = end_m[:, 2]
-    with np.errstate(invalid="ignore"):
-        above, below = z > rack.height_m + band, z < rack.height_m - band
-        own = above & (cells.owner_at(np.nan_to_num(end_m[:, :2])) == cells.slot[cell])
-        filled = ~above & (z > empty + slack)
-    kinds = [own, above, filled, below, np.isnan(z)]
-    return np.select(kinds, [STANDING, HIDDEN, FILLED, PASSED, SILENT], AT_FACE).astype(np.intp)
-
-
-def _covered(
-    lines: LinesOfSight, cells: OpeningCells, rack: RackModel, tubes: Sequence[TubeModel], depth_std_m: float
-) -> tuple[FloatArray, FloatArray]:
-    """Share of every slot's core, at the face, with points above it, shape (S,), and the core's cells, shape (S,)."""
-    n_slots = len(rack.all_slots)
-    with np.errstate(invalid="ignore"):
-        above = lines.end_m[lines.end_m[:, 2] > rack.height_m + BOW_M + 3 * depth_std_m]
-    filled = np.zeros(len(cells.slot), bool)
-    at = cells.cell_at(above[:, :2])
-    filled[at[at >= 0]] = True
-    radius, _ = core_radius_m(rack, tubes)
-    core = np.hypot(*(cells.center_m - rack.slot_centers_m[cells.slot]).T) < radius[cells.slot]
-    count = np.bincount(cells.slot, core, n_slots)
-    return np.bincount(cells.slot, core & filled, n_slots) / np.maximum(count, 1), count
-
-
-def _inside_image(
-    cells: OpeningCells, rack: RackModel, intrinsics: CameraIntrinsics, T_camera_rack: FloatArray
-) -> FloatArray:
-    """1 for every cell that lies inside the image, else 0, shape (C,)."""
-    points = np.column_stack([cells.center_m, np.full(len(cells.slot), rack.height_m)])
-    uv = intrinsics.project(points @ T_camera_rack[:3, :3].T + T_camera_rack[:3, 3])
-    with np.errstate(invalid="ignore"):
-        inside = (uv > -0.5).all(axis=1) & (uv < np.array([intrinsics.width, intrinsics.height]) - 0.5).all(axis=1)
-    return np.asarray(inside, float)
+    patches = (passed_m2 / PATCH_M**2, stopped * cells.cell_m**2 / PATCH_M**2)
+    table = np.column_stack([in_image, shares, covered, seen, *patches]).tolist()
+    return tuple(SlotLook(slot.name, *row) for slot, row in zip(rack.all_slots, table, strict=True))

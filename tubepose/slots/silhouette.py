@@ -1,4 +1,4 @@
-"""Lines of sight that a tube in a slot would have stopped, wherever it stood: the proof that none of a type is there."""
+"""Lines of sight that a tube in a slot would have stopped, wherever it stood: the proof that none is there."""
 
 from __future__ import annotations
 
@@ -9,10 +9,13 @@ import numpy as np
 
 from tubepose.labware import RackModel, TubeModel
 from tubepose.slots.cells import SLENDER, OpeningCells
+from tubepose.slots.sight_kernels import least_passing
 from tubepose.transforms import FloatArray
 
 MARGIN_M = 5.0e-4
 """A silhouette is taken this much smaller all around, metres: the rack's pose (0.3 mm), and half a pixel."""
+RIM_M = 1.0e-3
+"""The upper end of a tube counts from this far below it, metres: edges are rounded, and there the outline closes."""
 LEVELS = 5
 """Heights at which a tube's outline is cut: discs of neighbouring ones overlap."""
 STEPS = (-1.0, -0.5, 0.0, 0.5, 1.0)
@@ -47,7 +50,7 @@ def contradicting_m2(
         passing: Share of every grid place's lines of sight that ended at the face or below, shape (X, Y).
         cells: The grid.
         rack: The rack.
-        tubes: Types that can stand in it; without any, a body of `SLENDER` of the opening's width that ends at the face.
+        tubes: Types that can stand in it; without any, a body of `SLENDER` of the opening's width, as high as the face.
         camera_m: Place of the camera, rack frame, shape (3,), metres; above the face.
     """
     summed = np.zeros((passing.shape[0] + 1, passing.shape[1]))
@@ -64,8 +67,7 @@ def _outline(rack: RackModel, tube: TubeModel | None) -> Outline:
     out_m = rack.floor_m + tube.height_m - rack.height_m
     heights = np.linspace(0.0, out_m, LEVELS) if out_m > 0 else np.array([out_m])
     z, r = tube.outer_profile_m().T
-    # Just below the upper end: there the outline closes.
-    radius = np.interp(np.minimum(heights + rack.depth_m, z.max() - MARGIN_M), z, r)
+    radius = np.interp(np.minimum(heights + rack.depth_m, z.max() - RIM_M), z, r)
     clearance = np.maximum(widths / 2 - tube.body_radius_m(rack.depth_m), 0.0)
     return Outline(heights, np.repeat(radius[:, None], len(widths), axis=1), clearance)
 
@@ -81,20 +83,6 @@ def _least_area(
     axis = rack.slot_centers_m + ways * lever[:, None, :, None]
     k = (outline.height_m / (camera_m[2] - rack.height_m))[:, None, None]
     middle = (axis - k[..., None] * camera_m[:2]) / (1 - k[..., None])
-    radius = np.maximum(outline.radius_m[:, None] - MARGIN_M, 0.0) / (1 - k)
-    middle = (middle - cells.low_m) / cells.cell_m
-    radius = radius / cells.cell_m
-    first = np.floor((middle[..., 1] - radius).min(axis=0)).astype(np.intp)
-    count = int(np.ceil(((middle[..., 1] + radius).max(axis=0) - first).max())) + 1
-    rows = first[..., None] + np.arange(count)
-    chord2 = radius[..., None] ** 2 - (rows + 0.5 - middle[..., 1, None]) ** 2
-    chord = np.where(chord2 > 0, np.sqrt(np.maximum(chord2, 0)), np.nan)
-    low = np.where(np.isnan(chord), np.inf, middle[..., 0, None] - chord).min(axis=0)
-    high = np.where(np.isnan(chord), -np.inf, middle[..., 0, None] + chord).max(axis=0)
-    inside = (high > low) & (rows >= 0) & (rows < summed.shape[1])
-    # A place is inside where its middle is.
-    last = summed.shape[0] - 1
-    start = np.clip(np.where(inside, np.ceil(low - 0.5), 0), 0, last).astype(np.intp)
-    end = np.clip(np.where(inside, np.floor(high - 0.5) + 1, 0), start, last).astype(np.intp)
-    row = np.clip(rows, 0, summed.shape[1] - 1)
-    return np.asarray((summed[end, row] - summed[start, row]).sum(axis=-1).min(axis=0))
+    radius = np.maximum(outline.radius_m - MARGIN_M, 0.0) / (1 - k[:, 0])
+    places = np.ascontiguousarray((middle - cells.low_m) / cells.cell_m)
+    return np.asarray(least_passing(summed, places, radius / cells.cell_m))

@@ -20,8 +20,15 @@ MISSED = 0.01
 a ghost that fills a slot. It bounds `p_occupied` of what no method found or believed."""
 ACCEPTED = 0.99
 """Least probability that a slot with an accepted tube is occupied."""
-LEAST_PATCHES = 2.0
-"""Fewer telling patches (2 of 3 x 3 mm, 18 mm^2) move the prior less than one wrong patch moves it back."""
+PRIOR_DOUBTFUL = 0.9
+"""The same of a slot in which a method found something that it did not accept: most of that stands there. A stated
+prior, not a measured one."""
+LEAST_PATCHES = 1.0
+"""Less than one patch is not evidence: a rack's pose that is off by 0.5 mm gives a third of one where a cap stands
+(simulated racks)."""
+MOST_DISSENT = 0.25
+"""Patches that say the opposite, as a share of those for a state, above which it is not stated: five times what ghosts
+are expected to be, so that something else is there, a clear tube say."""
 SURE = 0.95
 """A state is stated from this probability on: with the model's patches, from one more for it than against it."""
 
@@ -71,18 +78,22 @@ class StatedSlot:
     seen_share: float
 
 
-def p_occupied(look: SlotLook) -> float:
-    """Probability that something opaque stands in a slot, from its patches alone: naive Bayes, Bernoulli patches.
+def p_occupied(look: SlotLook, prior: float = PRIOR_OCCUPIED) -> float:
+    """Probability that something opaque stands in a slot, from its patches: naive Bayes, a Bernoulli law per patch.
 
-    A patch that nothing came back from says nothing: black caps and dark wells are alike. Of patches that were stopped
-    and patches that passed each counts once.
+    A patch that nothing came back from says nothing, P(no return | empty) = P(no return | occupied): black caps and
+    dark wells are alike.
+
+    Args:
+        look: What was seen of the slot.
+        prior: Probability before it was looked at.
     """
     stopped = np.log((1 - PASSES_OCCUPIED) / (1 - PASSES_EMPTY))
     passed = np.log(PASSES_OCCUPIED / PASSES_EMPTY)
-    log_odds = np.log(PRIOR_OCCUPIED / (1 - PRIOR_OCCUPIED))
+    log_odds = np.log(prior / (1 - prior))
     log_odds += look.patches_stopped * stopped + look.patches_passed * passed
     p = 1 / (1 + np.exp(-np.clip(log_odds, -50, 50)))
-    return float(MISSED * PRIOR_OCCUPIED + (1 - MISSED) * p)
+    return float(MISSED * prior + (1 - MISSED) * p)
 
 
 def state_slot(look: SlotLook | None, finding: Finding) -> StatedSlot:
@@ -93,14 +104,20 @@ def state_slot(look: SlotLook | None, finding: Finding) -> StatedSlot:
         finding: What the method answered. An accepted tube is believed; what was not accepted is never called empty.
     """
     share = look.seen_share if look is not None else float("nan")
+    prior = PRIOR_OCCUPIED if finding is Finding.NONE else PRIOR_DOUBTFUL
     seen = look is not None and look.patches_passed + look.patches_stopped >= LEAST_PATCHES
-    p = p_occupied(look) if look is not None and seen else PRIOR_OCCUPIED
+    p = p_occupied(look, prior) if look is not None and seen else prior
     if finding is Finding.TUBE:
         return StatedSlot(SlotState.OCCUPIED, max(p, ACCEPTED), share)
-    if finding is Finding.DOUBTFUL:
-        return StatedSlot(SlotState.OCCUPIED if p >= SURE else SlotState.UNCLEAR, p, share)
-    if not seen:
-        return StatedSlot(SlotState.NOT_SEEN, p, share)
-    if p <= 1 - SURE:
-        return StatedSlot(SlotState.EMPTY, p, share)
-    return StatedSlot(SlotState.OCCUPIED if p >= SURE else SlotState.UNCLEAR, p, share)
+    if look is None or not seen:
+        return StatedSlot(SlotState.NOT_SEEN if finding is Finding.NONE else SlotState.UNCLEAR, p, share)
+    passed, stopped = look.patches_passed, look.patches_stopped
+    state = SlotState.UNCLEAR
+    if p >= SURE and passed <= MOST_DISSENT * stopped:
+        state = SlotState.OCCUPIED
+    elif p <= 1 - SURE and stopped <= MOST_DISSENT * passed and finding is Finding.NONE:
+        state = SlotState.EMPTY
+    if state is SlotState.UNCLEAR:
+        # Patches that contradict each other make the model's own probability too sure.
+        p = float(np.clip(p, 1 - SURE, SURE))
+    return StatedSlot(state, p, share)
