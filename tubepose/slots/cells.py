@@ -71,17 +71,19 @@ def opening_cells(rack: RackModel, cell_m: float) -> OpeningCells:
 
 
 def empty_height_m(cells: OpeningCells, rack: RackModel, camera_m: FloatArray) -> FloatArray:
-    """Height at which a line of sight through the middle of each cell ends in an empty slot, shape (C,), metres.
+    """Greatest height at which a line of sight through each cell ends in an empty slot, shape (C,), metres.
 
-    A slot is its opening, carried straight down to the floor: a line of sight ends on the wall or on the floor.
-    The rounding of corners is left out.
+    A slot is its opening, carried straight down to the floor: a line of sight ends on the wall or on the floor. Nearly
+    along the wall a small shift moves that end by much: the line of the cell that meets the wall first counts, with
+    the error of the rack's pose. The rounding of corners is left out.
 
     Args:
         cells: Cells of the rack's openings.
         rack: The rack.
         camera_m: Place of the camera, rack frame, shape (3,), metres; above the face.
     """
-    half = np.array([slot.half_size_m for slot in rack.all_slots])[cells.slot]
+    nearer = cells.cell_m / np.sqrt(2) + EDGE_M
+    half = np.array([slot.half_size_m for slot in rack.all_slots])[cells.slot] - nearer
     is_round = np.array([slot.shape == "round" for slot in rack.all_slots])[cells.slot]
     q = cells.center_m - rack.slot_centers_m[cells.slot]
     # Shift to the side per metre of descent.
@@ -90,7 +92,8 @@ def empty_height_m(cells: OpeningCells, rack: RackModel, camera_m: FloatArray) -
         sides = np.where(g == 0, np.inf, (half - np.sign(g) * q) / np.abs(g)).min(axis=1)
         a, b, c = (g**2).sum(axis=1), (g * q).sum(axis=1), (q**2).sum(axis=1) - half[:, 0] ** 2
         circle = np.where(a == 0, np.inf, (-b + np.sqrt(np.maximum(b**2 - a * c, 0))) / a)
-    descent = np.minimum(np.where(is_round, circle, sides), rack.depth_m)
+        circle = np.where(c > 0, 0.0, circle)
+    descent = np.clip(np.where(is_round, circle, sides), 0.0, rack.depth_m)
     return np.asarray(rack.height_m - descent)
 
 

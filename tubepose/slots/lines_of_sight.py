@@ -19,7 +19,7 @@ LEAST_CELL_M = 1.0e-3
 CELL_STEP_M = 2.5e-4
 """Cells come in steps of this, metres, so that frames of one camera share their grid."""
 SPACINGS = 1.5
-"""Side of a cell in spacings of the lines: more than sqrt(2), so that none is without a line, however they are turned."""
+"""Side of a cell in spacings of the lines: more than sqrt(2), so that none is without a line, whatever their turn."""
 SAMPLE = 20_000
 """Points that tell how dense a cloud without pixels is."""
 BOW_M = 2.5e-3
