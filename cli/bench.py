@@ -169,8 +169,9 @@ def _slot_notes(slots: pd.DataFrame) -> list[str]:
     told: dict[str, list[str]] = {}
     for row in slots.to_dict("records"):
         words = (
-            f"{row['n_found']} of {row['n_occupied']} occupied ones found, "
-            f"{row['n_left_empty']} of {row['n_empty']} empty ones left empty"
+            f"{row['n_found']} of {row['n_occupied']} occupied ones found ({row['n_called_empty']} called empty), "
+            f"{row['n_left_empty']} of {row['n_empty']} empty ones left empty ({row['n_called_occupied']} called "
+            f"occupied), {row['n_not_seen']} not seen, {row['n_unclear']} unclear"
         )
         told.setdefault(words, []).append(str(row["method"]))
     return [f"Slots ({', '.join(methods)}): {words}." for words, methods in told.items()] or ["Slots: none judged."]

@@ -193,7 +193,7 @@ def test_every_frame_of_a_recording_has_its_rows() -> None:
     tables = run(job("film", *frames, T_camera_rack=T_CAMERA_RACK, session="s", trial="t"))
     found = [(row["session"], row["trial"], row["frame"], row["slot"]) for row in tables.estimates]
     assert found == [("s", "t", 0, "B2"), ("s", "t", 1, "A1"), ("s", "t", 1, "C4")]
-    occupied = [(row["frame"], row["slot"]) for row in tables.slots if row["occupied"]]
+    occupied = [(row["frame"], row["slot"]) for row in tables.slots if row["state"] == "occupied"]
     assert occupied == [(0, "B2"), (1, "A1"), (1, "C4")]
 
 

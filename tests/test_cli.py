@@ -130,9 +130,10 @@ def test_every_slot_is_listed_and_the_filled_ones_are_the_declared(
         for trial in yaml.safe_load((small_session / "session.yaml").read_text())["trials"]
         for slot, tube in trial["tubes"].items()
     }
-    held = slots[(slots["method"] == "paper") & (slots["occupied"].astype(str) == "True")]
+    held = slots[(slots["method"] == "paper") & (slots["state"] == "occupied")]
     assert set(held[["trial", "slot", "tube"]].itertuples(index=False, name=None)) == declared
-    empty = slots[slots["occupied"].astype(str) == "False"]
+    assert set(slots["state"]) <= {"empty", "occupied", "not_seen", "unclear"}
+    empty = slots[slots["state"].isin(["empty", "not_seen"])]
     assert set(empty["tube"]) == {""}
     assert set(empty["n_points"]) == {0}
 
@@ -617,7 +618,7 @@ def test_recordings_give_the_same_slots_and_truth_as_folders(benched: tuple[Path
     assert len(list((tmp_path / "out" / "overlays").iterdir())) == 2
     folders, recordings = (table(out / "slots.csv") for out in (benched[0], tmp_path / "out"))
     folders = folders[folders["method"] == "upright"].reset_index(drop=True)
-    same = ["trial", "capture", "frame", "slot", "occupied", "tube", "status"]
+    same = ["trial", "capture", "frame", "slot", "state", "tube", "status"]
     assert folders[same].equals(recordings[same])
     truths = [pd.read_csv(out / "ground_truth.csv")[list(POSE_COLUMNS)] for out in (benched[0], tmp_path / "out")]
     # Depth images in folders are rounded to 0.02 mm.
@@ -734,7 +735,7 @@ def test_boxes_from_elsewhere_give_the_same_slots(
     assert (ended.code, ended.errors, "ambiguous" in ended.err) == (0, [], False)
     slots, wanted = table(tmp_path / "out" / "slots.csv"), table(estimated[0] / "slots.csv")
     wanted = wanted[(wanted["capture"] == frame.capture) & (wanted["method"] == "paper")]
-    assert list(slots["occupied"]) == list(wanted["occupied"])
+    assert list(slots["state"]) == list(wanted["state"])
     assert list(slots["status"]).count("ok") == 2
     record = json.loads((tmp_path / "out" / "run.json").read_text())
     assert record["detector"] == source

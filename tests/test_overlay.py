@@ -12,7 +12,8 @@ from tubepose.config import Config
 from tubepose.detection import Detection
 from tubepose.labware import load_rack, load_tube
 from tubepose.pipeline import Scene, TubeEstimate, estimate_tubes, prepare_scene
-from tubepose.report.overlay import COLORS_BGR, WIDTH_PX, Picture, _ImageView, draw_overlay
+from tubepose.report.overlay import COLORS_BGR, STATE_COLORS_BGR, WIDTH_PX, Picture, _ImageView, draw_overlay
+from tubepose.slots import SlotState
 from tubepose.transforms import FloatArray, transform_points
 from tubepose.tube import TubeStatus
 
@@ -91,6 +92,21 @@ def test_without_estimates_no_tube_is_drawn_and_the_rest_stays() -> None:
     changed = (full != bare).any(axis=-1)
     # The rings and the name of one tube: a small part of the picture.
     assert 0 < changed.mean() < 0.1
+
+
+def test_slots_that_were_not_seen_or_are_unclear_look_unlike_empty_ones() -> None:
+    unclear = tuple(replace(look, patches_passed=3.0, patches_stopped=3.0) for look in SCENE.looks)
+    free = tuple(replace(look, patches_passed=9.0, patches_stopped=0.0) for look in SCENE.looks)
+    drawn = {
+        name: [
+            pixels_of(below_the_strip(replace(SCENE, looks=looks), ()), color) for color in STATE_COLORS_BGR.values()
+        ]
+        for name, looks in {SlotState.NOT_SEEN: (), SlotState.UNCLEAR: unclear, SlotState.EMPTY: free}.items()
+    }
+    assert list(STATE_COLORS_BGR) == [SlotState.NOT_SEEN, SlotState.UNCLEAR]
+    gray, none = drawn[SlotState.NOT_SEEN][0], drawn[SlotState.EMPTY]
+    assert gray > none[0] + 50
+    assert drawn[SlotState.UNCLEAR][1] > none[1] + 50
 
 
 def test_the_picture_is_of_one_width_and_not_blank() -> None:

@@ -269,7 +269,7 @@ def seen():
 
 def test_profile_needs_neither_boxes_nor_the_slots_of_others(seen):
     assert seen.targets == ()
-    assert [time.stage for time in seen.times] == ["detect", "sensor"]
+    assert [time.stage for time in seen.times] == ["detect", "sensor", "slots"]
     estimates, times = estimate_tubes(seen, "profile", CONFIG)
     assert {e.target.slot: e.target.tube for e in estimates} == {slot: tube for slot, (tube, _) in PLACED.items()}
     assert {(e.method, e.seed, e.target.detection, e.target.reason) for e in estimates} == {("profile", None, None, "")}
@@ -329,9 +329,9 @@ def test_a_tube_across_the_rack_is_no_target_of_profile_but_a_row_with_a_reason(
     beside = {slot.name for slot in RACK.all_slots if np.any(np.abs(slot.center_m) > (52e-3, 14e-3))}
     assert covered
     for name, row in rows.items():
-        assert row["occupied"] or name not in covered
-        assert not (row["occupied"] and name in beside)
-        if row["occupied"]:
+        assert row["state"] != "empty" or name not in covered
+        assert not (row.get("status") and name in beside)
+        if row.get("status"):
             assert (row["status"], row["reason"]) == ("rejected", estimate.pose.reason)
 
 
@@ -345,8 +345,8 @@ def test_a_slot_with_two_finds_has_one_row_and_it_is_the_first(seen):
     )
     rows = slot_rows({}, "profile", seen, (*estimates, second))
     (row,) = [row for row in rows if row["slot"] == first.target.slot]
-    assert (row["tube"], row["status"], row["occupied"]) == (first.target.tube.name, "ok", True)
-    assert sum(row["occupied"] for row in rows) == len(estimates)
+    assert (row["tube"], row["status"], row["state"]) == (first.target.tube.name, "ok", "occupied")
+    assert sum(row["state"] == "occupied" for row in rows) == len(estimates)
 
 
 # What a detector's classes say of the types

@@ -74,7 +74,7 @@ def _bases() -> Iterator[Path]:
 
 SOURCES = (
     Path(__file__),
-    *(path for part in ("profile", "rack", "sensor") for path in _HERE.glob(f"{part}/*kernels.py")),
+    *(path for part in ("profile", "rack", "sensor", "slots") for path in _HERE.glob(f"{part}/*kernels.py")),
 )
 """The files of all loops over points."""
 compiled = compiler(SOURCES, error_model="numpy")

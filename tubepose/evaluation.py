@@ -294,29 +294,35 @@ def compare(errors: pd.DataFrame, reference_method: str, draws: int = DRAWS, see
 
 
 def slot_accuracy(slots: pd.DataFrame, declared: pd.DataFrame) -> pd.DataFrame:
-    """How many occupied slots were found occupied, and how many empty ones were left empty.
+    """How many occupied slots were called occupied, how many empty ones empty, and how many were not stated.
 
     Args:
         slots: Rows of slots.csv.
         declared: One row per session, trial and occupied slot: ground_truth.csv, refused rows too.
 
     Returns:
-        Rows of slot_accuracy.csv: method, n_occupied, n_found, n_empty, n_left_empty. Trials without declared tubes
-        and frames without a rack's pose are left out.
+        Rows of slot_accuracy.csv: method, n_occupied, n_found, n_called_empty, n_empty, n_left_empty,
+        n_called_occupied, n_not_seen, n_unclear. Slots that were not seen or are unclear count among the occupied or
+        the empty ones, and as neither right nor wrong. Trials without declared tubes and frames without a rack's pose
+        are left out.
     """
     trials = declared[_TRIAL].drop_duplicates()
     judged = slots.merge(trials, on=_TRIAL).merge(
         declared[[*_TRIAL, "slot"]].assign(declared=True), how="left", on=[*_TRIAL, "slot"]
     )
     holds = judged["declared"].notna()
-    found = judged["occupied"].astype(bool)
+    state = judged["state"]
     counts = pd.DataFrame(
         {
             "method": judged["method"],
             "n_occupied": holds,
-            "n_found": holds & found,
+            "n_found": holds & (state == "occupied"),
+            "n_called_empty": holds & (state == "empty"),
             "n_empty": ~holds,
-            "n_left_empty": ~holds & ~found,
+            "n_left_empty": ~holds & (state == "empty"),
+            "n_called_occupied": ~holds & (state == "occupied"),
+            "n_not_seen": state == "not_seen",
+            "n_unclear": state == "unclear",
         }
     )
     return counts.groupby("method", sort=False).sum().astype(int).reset_index()

@@ -20,6 +20,7 @@ from tubepose.rack import RackPose, RackStatus, register_rack
 from tubepose.rivals import fit_gicp, fit_kiss_matcher
 from tubepose.scene import Scene, TubeEstimate, TubeTarget
 from tubepose.sensor import measure_noise, prior_noise
+from tubepose.slots import SlotLook, look_at_slots
 from tubepose.stage_times import Clock, StageTime
 from tubepose.targets import allowed_types, boxes_alone, find_targets
 from tubepose.transforms import FloatArray
@@ -100,7 +101,11 @@ def prepare_scene(
                 detections = detector.checked(frame, rack_pose.T_camera_rack, detections)
         with clock.stage("slots"):
             targets = find_targets(frame, rack, tubes, detections, rack_pose.T_camera_rack, config)
-    return Scene(frame, rack, tuple(tubes), intrinsics, detections, rack_pose, noise, targets, clock.shared())
+    looks: tuple[SlotLook, ...] = ()
+    if rack_pose.T_camera_rack is not None:
+        with clock.stage("slots"):
+            looks = look_at_slots(frame, intrinsics, rack_pose.T_camera_rack, rack, tubes)
+    return Scene(frame, rack, tuple(tubes), intrinsics, detections, rack_pose, noise, targets, clock.shared(), looks)
 
 
 def estimate_tubes(

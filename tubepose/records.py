@@ -9,11 +9,11 @@ import numpy as np
 import pandas as pd
 
 from tubepose.capture.frame import RgbdFrame
+from tubepose.occupancy import held_slots, stated_slots
 from tubepose.pipeline import Scene, StageTime, TubeEstimate, best_rack
 from tubepose.pose_errors import COVARIANCE_COLUMNS, upper_half
 from tubepose.rack import RackPose
 from tubepose.sensor import SensorNoise
-from tubepose.slots import covered_slots
 from tubepose.transforms import FloatArray, quaternion_wxyz, tilt_rad
 
 Row = dict[str, Any]
@@ -43,7 +43,9 @@ SLOT_COLUMNS = (
     "frame",
     "method",
     "slot",
-    "occupied",
+    "state",
+    "p_occupied",
+    "seen_share",
     "tube",
     "share",
     "n_points",
@@ -134,22 +136,14 @@ def sensor_row(keys: Row, frame: RgbdFrame, noise: SensorNoise) -> Row:
 def slot_rows(keys: Row, method: str, scene: Scene, estimates: Sequence[TubeEstimate]) -> list[Row]:
     """Rows of slots.csv, one per slot of the rack; none without the rack's pose.
 
-    What stands in no slot, or is no known tube, covers slots all the same: they are not empty.
+    What stands in no slot, or is no known tube, covers slots all the same: they are not called empty.
     """
-    if scene.rack_pose.T_camera_rack is None:
-        return []
-    # The first of a slot counts: what was found in it besides comes after it.
-    held = {
-        name: estimate
-        for estimate in estimates
-        if estimate.target.slot is None
-        for name in covered_slots(estimate.target.points_m, scene.rack)
-    }
-    held |= {estimate.target.slot: estimate for estimate in reversed(estimates) if estimate.target.slot is not None}
+    held = held_slots(scene, estimates)
     rows = []
-    for slot in scene.rack.all_slots:
-        estimate = held.get(slot.name)
-        row: Row = {**keys, "method": method, "slot": slot.name, "occupied": estimate is not None, "n_points": 0}
+    for name, stated in stated_slots(scene, estimates).items():
+        estimate = held.get(name)
+        said = {"state": stated.state.value, "p_occupied": stated.p_occupied, "seen_share": stated.seen_share}
+        row: Row = {**keys, "method": method, "slot": name, **said, "n_points": 0}
         if estimate is not None:
             target = estimate.target
             row |= {

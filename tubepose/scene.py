@@ -9,6 +9,7 @@ from tubepose.detection import Detection
 from tubepose.labware import RackModel, TubeModel
 from tubepose.rack import RackPose
 from tubepose.sensor import SensorNoise
+from tubepose.slots import SlotLook
 from tubepose.stage_times import StageTime
 from tubepose.transforms import FloatArray
 from tubepose.tube import TubePose
@@ -49,6 +50,7 @@ class Scene:
         noise: The sensor's noise, measured in this frame; the prior without the rack's pose.
         targets: Every detected tube (empty without a rack's pose).
         times: Duration of the shared stages.
+        looks: What was seen of every slot, in the order of the rack's slots (empty without a rack's pose).
     """
 
     frame: RgbdFrame
@@ -60,6 +62,7 @@ class Scene:
     noise: SensorNoise
     targets: tuple[TubeTarget, ...]
     times: tuple[StageTime, ...]
+    looks: tuple[SlotLook, ...] = ()
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -9,7 +9,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from tubepose.occupancy import stated_slots
 from tubepose.pipeline import Scene, TubeEstimate, best_rack
+from tubepose.slots import SlotState
 from tubepose.transforms import FloatArray, transform_points
 from tubepose.tube import TubeStatus
 
@@ -25,6 +27,9 @@ COLORS_BGR = {
 _RACK_BGR = (230, 170, 40)
 _BOX_BGR = (200, 200, 90)
 _TEXT_BGR = (245, 245, 245)
+STATE_MARKS = {SlotState.NOT_SEEN: "-", SlotState.UNCLEAR: "?"}
+"""What stands behind the name of a slot that is not known to be empty or occupied."""
+STATE_COLORS_BGR = {SlotState.NOT_SEEN: (150, 150, 150), SlotState.UNCLEAR: (60, 220, 250)}
 
 
 def draw_overlay(scene: Scene, estimates: Sequence[TubeEstimate]) -> Picture:
@@ -185,6 +190,7 @@ def _draw_names(picture: Picture, scene: Scene, estimates: Sequence[TubeEstimate
     heights = {e.target.slot: e.target.tube.height_m for e in estimates if e.target.slot and e.target.tube}
     colors = {e.target.slot: COLORS_BGR[e.pose.status.value] for e in estimates}
     tops = [place for e in estimates if (place := _top_circle(e, project)) is not None]
+    states = {name: stated.state for name, stated in stated_slots(scene, estimates).items()}
     for slot in scene.rack.all_slots:
         z = scene.rack.floor_m + heights[slot.name] if slot.name in heights else scene.rack.height_m
         place = project(transform_points(T, np.array([*slot.center_m, z])))
@@ -192,7 +198,8 @@ def _draw_names(picture: Picture, scene: Scene, estimates: Sequence[TubeEstimate
         hidden = slot.name not in heights and any(np.hypot(*(place - top[:2])) < top[2] for top in tops)
         if np.isfinite(place).all() and not hidden:
             u, v = _pixel(place)
-            _text(picture, slot.name, (u - 12, v + 5), 0.45, colors.get(slot.name, _TEXT_BGR))
+            color = colors.get(slot.name, STATE_COLORS_BGR.get(states[slot.name], _TEXT_BGR))
+            _text(picture, slot.name + STATE_MARKS.get(states[slot.name], ""), (u - 12, v + 5), 0.45, color)
 
 
 def _top_circle(estimate: TubeEstimate, project: Project) -> FloatArray | None:
