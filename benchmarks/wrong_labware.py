@@ -10,7 +10,7 @@ kind of case each frame gets --per-kind cases, drawn by its name (0: all of them
 WRONG is: a rack `ok` under another name, or more than 2 mm or 2 deg off at the centre of its face (a turn that is
 marked ambiguous counts as right either way); a slot called empty that holds a tube, or occupied that holds none; a tube
 `ok` of another type, under another slot's name, or more than 2 mm or 2 deg off across its axis, or more than 2 mm along
-it where it wears a closed cap. Open tubes off along their axes are counted apart: the capture does not show their floor.
+it where it wears a closed cap. Open tubes off along their axes are counted apart: no capture shows their floor.
 --out gets answers.csv, one row per frame and case, and table.md.
 """
 
