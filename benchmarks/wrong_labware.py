@@ -41,6 +41,7 @@ from tubepose.simulation import SENSORS
 
 FULL_FRAMES = 500
 MOST_WORKERS = 2
+SEPARATOR = " | "
 KEYS = ("frame", "kind", "case", "true_rack", "asked_rack", "n_tubes_true", "bow_x_mm", "bow_y_mm")
 COUNTS = tuple(field.name for field in dataclasses.fields(Verdict))
 COLUMNS = (*KEYS, "wrong", *COUNTS, "resolved_by", "duration_ms", "reason", "tubes_not_ok", "stated_slots")
@@ -72,7 +73,7 @@ def ask(case: Case, config: Config) -> tuple[Answer, Row]:
     rack = rack_row(scene)
     slots = slot_rows({}, DEFAULT_METHOD, scene, estimates)
     tubes = [
-        StatedTube(e.target.slot, e.target.tube.name, e.target.tube, e.T_camera_tube)
+        StatedTube(e.target.slot, e.target.tube.name, e.target.tube, e.T_camera_tube, e.pose.covariance)
         for e in estimates
         if e.pose.status.value == "ok" and e.T_camera_tube is not None and e.target.tube is not None
     ]
@@ -97,10 +98,10 @@ def stated(row: Row) -> str:
 
 
 def _not_ok(scene: Scene, estimates: Sequence[Any]) -> str:
-    """Slot and reason of every tube that is not stated: `A1: reason; ...`."""
+    """Slot and reason of every tube that is not stated: `A1: reason | B2: ...`, as reasons have semicolons."""
     rows = [estimate_row({}, scene, estimate) for estimate in estimates]
     words = [f"{row['slot']}: {row.get('reason_code') or row['reason']}" for row in rows if row["status"] != "ok"]
-    return "; ".join(words)
+    return SEPARATOR.join(words)
 
 
 def frame_rows(plan: Plan, number: int) -> list[Row]:

@@ -53,12 +53,13 @@ class Truth:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class StatedTube:
-    """A tube that an estimator states with status `ok`."""
+    """A tube that an estimator states with status `ok`; `covariance` (5, 5) is that of its pose, where it is stated."""
 
     slot: str | None
     type_name: str
     model: TubeModel
     T_camera_tube: FloatArray
+    covariance: FloatArray | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
