@@ -13,6 +13,7 @@ from scipy.spatial.transform import Rotation
 from tubepose.capture.frame import CameraIntrinsics
 from tubepose.errors import LabwareError
 from tubepose.labware import CapModel, RackModel, SlotModel, TubeModel
+from tubepose.simulation.bow import FLAT, Bow
 from tubepose.simulation.collision import CLEARANCE_M, Solid, collide, solid_of
 from tubepose.simulation.scene import PlacedTube
 from tubepose.transforms import FloatArray, axis_rotation, make_transform, transform_points
@@ -38,6 +39,7 @@ def place_tubes(
     cap: CapModel,
     rng: np.random.Generator,
     cap_albedo: tuple[float, float] = CAP_ALBEDO,
+    bow: Bow = FLAT,
 ) -> tuple[PlacedTube, ...]:
     """Put up to `count` perfect tubes of random types into random slots of a rack.
 
@@ -52,6 +54,8 @@ def place_tubes(
         cap: The printed cap that there must be room for.
         rng: Source of randomness; poses depend on nothing else but the arguments above.
         cap_albedo: Least and most brightness of own caps, one value per type.
+        bow: Of the rack. Each tube stands in its slot as in a flat rack, and moves with the slot; tubes have room
+            beside each other where they stand then.
 
     Raises:
         LabwareError: A type fits into no slot, or is too short to wear the printed cap there.
@@ -72,18 +76,18 @@ def place_tubes(
         model = types[int(rng.integers(len(types)))]
         if not _fits(rack, slot, model, cap):
             continue
-        upright = _standing(rack, slot, model, np.zeros(2), np.zeros(2))
+        upright = bow.moved(rack, slot, _standing(rack, slot, model, np.zeros(2), np.zeros(2)))
         tube = PlacedTube(slot.name, model, upright, 0.0, albedo[model.name])
         standing = solid_of(tube, cap)
         found: tuple[PlacedTube, Solid] | None = (tube, standing)
         if _collides(standing, solids, cap):
-            found = _leaned(rack, tube, solids, cap, rng)
+            found = _leaned(rack, tube, solids, cap, rng, bow)
         if found is not None:
             placed.append(found[0])
             solids.append(found[1])
     for _ in range(_SWEEPS):
         for k in rng.permutation(len(placed)):
-            found = _leaned(rack, placed[k], solids[:k] + solids[k + 1 :], cap, rng)
+            found = _leaned(rack, placed[k], solids[:k] + solids[k + 1 :], cap, rng, bow)
             if found is not None:
                 placed[k], solids[k] = found
     order = {slot.name: k for k, slot in enumerate(rack.all_slots)}
@@ -91,11 +95,12 @@ def place_tubes(
 
 
 def _leaned(
-    rack: RackModel, tube: PlacedTube, others: Sequence[Solid], cap: CapModel, rng: np.random.Generator
+    rack: RackModel, tube: PlacedTube, others: Sequence[Solid], cap: CapModel, rng: np.random.Generator, bow: Bow
 ) -> tuple[PlacedTube, Solid] | None:
     """The tube with a random lean and turn of its printed cap that fits beside others, or None."""
     for _ in range(_LEANS):
-        pose = lean(rack, rack.slot(tube.slot), tube.model, rng)
+        slot = rack.slot(tube.slot)
+        pose = bow.moved(rack, slot, lean(rack, slot, tube.model, rng))
         spin = float(rng.uniform(-MAX_CAP_SPIN_RAD, MAX_CAP_SPIN_RAD))
         leaned = dataclasses.replace(tube, T_rack_tube=pose, cap_spin_rad=spin)
         solid = solid_of(leaned, cap)

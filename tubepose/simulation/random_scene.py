@@ -13,6 +13,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from tubepose.labware import CapModel, RackModel, TubeModel, WallOptics
+from tubepose.simulation.bow import Bow
 from tubepose.simulation.camera import StructuredLightCamera
 from tubepose.simulation.collision import CLEARANCE_M, collide, solid_of
 from tubepose.simulation.placement import place_rack, place_tubes
@@ -54,8 +55,10 @@ def random_scene(
         LabwareError: A tube cannot stand in the rack, or the rack does not fit into the view.
     """
     look_rng, wall_rng, fit_rng, liquid_rng, label_rng = rng.spawn(5)
+    # A grandchild, so that the streams of the next scene from the same generator stay what they were.
+    bow = _bow(variation, look_rng.spawn(1)[0])
     count = max(1, round(_uniform(rng, variation.fill) * len(rack.all_slots)))
-    tubes = place_tubes(rack, types, count, cap, rng, variation.cap_albedo)
+    tubes = place_tubes(rack, types, count, cap, rng, variation.cap_albedo, bow)
     tallest = rack.floor_m + max(max(model.height_m, cap.offset_m(model)) for model in types)
     low_deg, high_deg = variation.scanner_tilt_deg
     tilt_rad = (float(np.deg2rad(low_deg)), float(np.deg2rad(high_deg)))
@@ -71,7 +74,12 @@ def random_scene(
         )
         for tube in tubes
     )
-    return Scene(rack, T_camera_rack, tubes, finishes=_finishes(variation, look_rng))
+    return Scene(rack, T_camera_rack, tubes, finishes=_finishes(variation, look_rng), bow=bow)
+
+
+def _bow(variation: SceneVariation, rng: np.random.Generator) -> Bow:
+    along_x_mm, along_y_mm = (_uniform(rng, variation.rack_bow_mm) for _ in range(2))
+    return Bow(along_x_mm * 1e-3, along_y_mm * 1e-3)
 
 
 def fit_caps(

@@ -9,6 +9,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from tubepose.labware import CapModel, RackModel, TubeModel, WallOptics
+from tubepose.simulation.bent_meshes import base_height_m, bent_shell, bent_wells
+from tubepose.simulation.bow import FLAT, Bow
 from tubepose.simulation.meshes import Mesh, box, flat_polygon, merge, rack_shell, rack_wells, revolve, wall_patch
 from tubepose.transforms import FloatArray, make_transform
 
@@ -201,6 +203,8 @@ class Scene:
         materials: How the walls of bodies and flanges return light, by the material's name in the labware files. Sensor
             `raycast` only.
         finishes: How the opaque surfaces return light.
+        bow: How the rack's face is bent. `T_camera_rack` is that of the rack without it, and the poses of `tubes` are
+            where they stand with it.
     """
 
     rack: RackModel
@@ -209,19 +213,32 @@ class Scene:
     printed_cap: CapModel | None = None
     materials: dict[str, Material] | None = None
     finishes: Finishes = Finishes()
+    bow: Bow = FLAT
 
     def parts(self) -> Iterator[tuple[Mesh, Material]]:
         """Every solid of the scene with its material, camera frame."""
+        base_m = 0.0 if self.bow.flat else base_height_m(self.rack, self.bow)
         corners = np.array([[1, 1], [-1, 1], [-1, -1], [1, -1]]) * TABLE_HALF_SIZE_M
-        yield flat_polygon([corners], 0.0).transformed(self.T_camera_rack), self.finishes.table
-        rack = self.finishes.rack
-        well = replace(rack, albedo=WELL_ALBEDO * rack.albedo, ambient=WELL_AMBIENT)
-        yield rack_shell(self.rack).transformed(self.T_camera_rack), rack
-        yield rack_wells(self.rack).transformed(self.T_camera_rack), well
+        yield flat_polygon([corners], base_m).transformed(self.T_camera_rack), self.finishes.table
+        yield from self.rack_parts()
         materials = self.materials or MATERIALS | {"opaque": self.finishes.opaque_body}
         for tube in self.tubes:
             for mesh, material in tube_parts(tube, self.printed_cap, materials, self.finishes):
                 yield mesh.transformed(self.T_camera_rack @ tube.T_rack_tube), material
+
+    def rack_parts(self) -> Iterator[tuple[Mesh, Material]]:
+        """Shell and wells of the rack with their materials, camera frame."""
+        rack = self.finishes.rack
+        well = replace(rack, albedo=WELL_ALBEDO * rack.albedo, ambient=WELL_AMBIENT)
+        for mesh, material in zip(rack_meshes(self.rack, self.bow), (rack, well), strict=True):
+            yield mesh.transformed(self.T_camera_rack), material
+
+
+def rack_meshes(rack: RackModel, bow: Bow) -> tuple[Mesh, Mesh]:
+    """Shell and wells of a rack, bent where it is bowed, rack frame, metres."""
+    if bow.flat:
+        return rack_shell(rack), rack_wells(rack)
+    return bent_shell(rack, bow, base_height_m(rack, bow)), bent_wells(rack, bow)
 
 
 def tube_parts(

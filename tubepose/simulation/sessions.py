@@ -208,7 +208,8 @@ def _draw(plan: _Plan, settings: _Settings, printed: bool) -> _Trial:
 def _hint(scene: Scene, camera: StructuredLightCamera, rng: np.random.Generator) -> dict[str, Any]:
     """Where somebody would click on the first slot's opening."""
     slot = scene.rack.all_slots[0]
-    opening = scene.T_camera_rack @ np.array([*slot.center_m, scene.rack.height_m, 1.0])
+    height_m = scene.rack.height_m + float(scene.bow.height_m(scene.rack, slot.center_m))
+    opening = scene.T_camera_rack @ np.array([*slot.center_m, height_m, 1.0])
     k = camera.intrinsics
     click = camera.intrinsics.project(opening[:3]) + rng.normal(0, CLICK_ERROR_PX * k.width / 1376, 2)
     return {"slot": slot.name, "pixel": [int(value) for value in np.rint(click)]}

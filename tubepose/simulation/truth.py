@@ -14,8 +14,9 @@ from tubepose.capture.source import TRUTH_FOLDER
 from tubepose.errors import CaptureError
 from tubepose.labware import WallOptics
 from tubepose.labware.reading import read_yaml
+from tubepose.simulation.bow import FLAT, Bow
 from tubepose.simulation.scene import CapFit, Finishes, Label, Liquid, PlacedTube, Scene
-from tubepose.transforms import FloatArray, tilt_rad
+from tubepose.transforms import FloatArray, invert_transform, tilt_rad, transform_points
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,16 +47,19 @@ class ExactTruth:
         tubes: Per slot the tube's name in the session and its T_camera_tube, shape (4, 4), metres: the body's pose.
         as_made: Per slot how the tube differs from its definition.
         finishes: How the opaque surfaces return light; None in files that do not say.
+        bow: How the rack's face is bent. `T_camera_rack` is the pose without it, at the centre of the face the same.
     """
 
     T_camera_rack: FloatArray
     tubes: dict[str, tuple[str, FloatArray]]
     as_made: dict[str, TubeAsMade] = field(default_factory=dict)
     finishes: Finishes | None = None
+    bow: Bow = FLAT
 
 
 _AS_MADE = TypeAdapter(TubeAsMade)
 _FINISHES = TypeAdapter(Finishes)
+_BOW = TypeAdapter(Bow)
 
 
 def write_exact_truth(session_folder: Path, trial: str, scene: Scene, names: dict[str, str]) -> None:
@@ -65,6 +69,7 @@ def write_exact_truth(session_folder: Path, trial: str, scene: Scene, names: dic
         "format": 1,
         "trial": trial,
         "T_camera_rack": scene.T_camera_rack.tolist(),
+        **({} if scene.bow.flat else {"rack_bow": _BOW.dump_python(scene.bow, mode="json")}),
         "finishes": _FINISHES.dump_python(scene.finishes, mode="json"),
         "slots": slots,
     }
@@ -84,6 +89,8 @@ def _entry(scene: Scene, tube: PlacedTube, name: str) -> dict[str, Any]:
     slot = scene.rack.slot(tube.slot)
     axis = tube.T_rack_tube[:3, 2]
     pivot = tube.T_rack_tube[:3, 3] + tube.model.pivot_height_m * axis
+    if not scene.bow.flat:
+        pivot = transform_points(invert_transform(scene.bow.slot_frame(scene.rack, slot)), pivot)
     return {
         "tube": name,
         "T_camera_tube": (scene.T_camera_rack @ tube.T_rack_tube).tolist(),
@@ -110,6 +117,7 @@ def read_exact_truth(session_folder: Path, trial_name: str) -> ExactTruth:
             {slot: (str(entry["tube"]), _transform(entry["T_camera_tube"])) for slot, entry in slots.items()},
             {slot: _AS_MADE.validate_python(entry) for slot, entry in slots.items()},
             _FINISHES.validate_python(data["finishes"]) if "finishes" in data else None,
+            _BOW.validate_python(data["rack_bow"]) if "rack_bow" in data else FLAT,
         )
     except (KeyError, TypeError, ValueError, AttributeError) as problem:
         # What pydantic raises is a ValueError of several lines.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from math import inf
 from pathlib import Path
 from typing import Annotated, Any
@@ -34,6 +35,7 @@ Range = Annotated[Pair, _range(0.0, inf)]
 ShareRange = Annotated[Pair, _range(0.0, 1.0)]
 IndexRange = Annotated[Pair, _range(1.0, 2.5)]
 TiltRange = Annotated[Pair, _range(0.0, 60.0)]
+BowRange = Annotated[Pair, _range(-5.0, 5.0)]
 RoughnessRange = Annotated[Pair, _range(0.01, 1.0)]
 Share = Annotated[float, Field(ge=0.0, le=1.0)]
 Spread = Annotated[float, Field(ge=0.0, allow_inf_nan=False)]
@@ -62,6 +64,8 @@ class SceneVariation(BaseModel):
     Attributes:
         fill: Share of the slots that hold a tube; at least one does.
         scanner_tilt_deg: Angle between the camera's axis and the rack's normal.
+        rack_bow_mm: Height of the middles of the rack's sides over the centre of its face, drawn for x and y apart;
+            positive is away from the base.
         scattering_per_mm: Of see-through walls, one value per trial; null keeps what the labware files say.
         absorption_per_mm: As `scattering_per_mm`.
         refractive_index: As `scattering_per_mm`.
@@ -81,6 +85,7 @@ class SceneVariation(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
     fill: ShareRange = (0.10, 0.40)
     scanner_tilt_deg: TiltRange = (0.0, 20.0)
+    rack_bow_mm: BowRange = (0.0, 0.0)
     scattering_per_mm: Range | None = None
     absorption_per_mm: Range | None = None
     refractive_index: IndexRange | None = None
@@ -95,6 +100,12 @@ class SceneVariation(BaseModel):
     gloss_roughness: RoughnessRange = (0.30, 0.60)
     wall_roughness: RoughnessRange = (0.05, 0.10)
     tolerances: Tolerances = Tolerances()
+
+    def __repr_args__(self) -> Iterator[tuple[str | None, Any]]:
+        """Fields as they are printed. A rack that is not bowed is left out: names of sessions are digests of this."""
+        for name, value in super().__repr_args__():
+            if name != "rack_bow_mm" or value != (0.0, 0.0):
+                yield name, value
 
 
 def scene_variation(data: Any, where: str) -> SceneVariation:

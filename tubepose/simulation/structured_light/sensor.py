@@ -70,7 +70,10 @@ class Exposure:
 def expose(
     scene: Scene, camera: StructuredLightCamera, seed: int, *, effort: Effort = Effort(), threads: int = 1
 ) -> Exposure:
-    """Sums of all light paths of a scene, before the camera: the same for any number of threads."""
+    """Sums of all light paths of a scene, before the camera: the same for any number of threads.
+
+    The rack is flat here, whatever its bow; `bowed.bowed_sums` moves its light.
+    """
     shapes = shapes_of(scene)
     projector = projector_of(camera, scene.T_camera_rack)
     light_map = make_light_map(shapes)
@@ -142,4 +145,10 @@ def _blur_sigma_px(camera: StructuredLightCamera) -> float:
 def render(scene: Scene, camera: StructuredLightCamera, rng: np.random.Generator, *, threads: int = 1) -> RgbdFrame:
     """Simulate one capture of a scene; the frame's capture name is empty and its time unknown."""
     seed = int(rng.integers(2**63))
-    return camera.capture(expose(scene, camera, seed, threads=threads).sums, rng)
+    sums = expose(scene, camera, seed, threads=threads).sums
+    if not scene.bow.flat:
+        # Imported here: only a bowed rack needs meshes.
+        from tubepose.simulation.structured_light.bowed import bowed_sums
+
+        sums = bowed_sums(scene, camera, sums, threads)
+    return camera.capture(sums, rng)
