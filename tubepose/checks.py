@@ -39,6 +39,7 @@ SENTENCES = {
         "{value:.1f}% of the top's points lie just outside the outline of {name}, at most {limit:.1f}% expected: "
         "another rack?"
     ),
+    "bow": "its face would be bowed by {value:.1f} mm, at most {limit:g} mm expected: another surface than its top",
     "little_seen": "{value:.1f}% of the top seen, at least {limit:.0f}% expected",
     "not_in_view": (
         "no points at all on {value:.0f}% of the top, at most {limit:.0f}% expected: is the rack in the image as a whole?"

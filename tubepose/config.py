@@ -74,7 +74,7 @@ class RackTopConfig(_Section):
     plane_distance_m: float = 2.0e-3
     plane_iterations: int = 300
     max_planes: int = 3
-    bin_m: float = Field(default=5.0e-4, gt=0)
+    bin_m: float = Field(default=1.0e-3, gt=0)
     max_bands: int = 8
     band_m: float = 2.0e-3
     outline_tolerance_m: float = 5.0e-3
@@ -116,6 +116,7 @@ class RackConfig(_Section):
         max_scale: Largest difference of scale, as a share, of everything that is seen of the rack.
         max_scale_shift_mm: A difference of scale that moves the rack by more along the line of sight is marked.
         edge_std_mm: How far a sensor's blur and a projector's shadow move the edge of an outline.
+        max_bow_mm: Largest bow of a face, at the ends of its outline (two of two real racks: 0.7 to 2 mm).
         max_floor_mm: How far the slots' floor may be seen from where the file has it, beside three standard deviations.
         min_seen: Smallest share of the template that is seen: a rack full of caps shows 5 to 24 %.
         min_seen_held: The same where the tops of what stands in the rack tell its level.
@@ -152,10 +153,11 @@ class RackConfig(_Section):
     min_gain_sigmas: float = 1.5
     max_pitch_mm: float = 1.0
     max_openings_mm: float = 2.0
-    max_outline_mm: float = 2.5
+    max_outline_mm: float = 6.0
     max_scale: float = 0.0075
     max_scale_shift_mm: float = 2.0
     edge_std_mm: float = 0.3
+    max_bow_mm: float = 4.0
     max_floor_mm: float = 2.0
     min_seen: float = 0.1
     min_seen_held: float = 0.03

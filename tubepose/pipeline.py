@@ -15,7 +15,7 @@ from tubepose.detection import Detection, Detector, points_in_box
 from tubepose.detection.assisted import AssistedDetector
 from tubepose.labware import RackModel, TubeModel
 from tubepose.preprocessing import remove_outliers
-from tubepose.profile import ProfileTube, fit_profiles
+from tubepose.profile import FaceBow, ProfileTube, fit_profiles
 from tubepose.rack import RackPose, RackStatus, register_rack
 from tubepose.rivals import fit_gicp, fit_kiss_matcher
 from tubepose.scene import Scene, TubeEstimate, TubeTarget
@@ -153,6 +153,7 @@ def _profile_estimates(scene: Scene, config: Config) -> tuple[tuple[TubeEstimate
         config,
         rack_covariance=scene.rack_pose.covariance,
         allowed=allowed_types(scene),
+        bow=_bow(scene.rack_pose),
     )
     share_ms = (time.perf_counter_ns() - start) / 1e6 / max(len(found), 1)
     targets = [(_profile_target(tube), tube.pose) for tube in found]
@@ -160,6 +161,10 @@ def _profile_estimates(scene: Scene, config: Config) -> tuple[tuple[TubeEstimate
     estimates = tuple(_estimate(scene, DEFAULT_METHOD, None, *target) for target in targets)
     times = tuple(StageTime("tube", DEFAULT_METHOD, tube.slot or "", None, share_ms) for tube in found)
     return estimates, times
+
+
+def _bow(pose: RackPose) -> FaceBow | None:
+    return None if pose.bow_m is None or pose.bow_std_m is None else FaceBow(pose.bow_m, pose.bow_std_m)
 
 
 def _profile_target(tube: ProfileTube) -> TubeTarget:

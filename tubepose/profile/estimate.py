@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,6 +12,7 @@ from tubepose.capture.frame import CameraIntrinsics, RgbdFrame
 from tubepose.config import Config, ProfileConfig
 from tubepose.labware import RackModel, TubeModel
 from tubepose.preprocessing import TALLEST_TUBE_M
+from tubepose.profile.bowed import FaceBow, SlotFrame, in_rack_frame, slot_frame
 from tubepose.profile.floor import SETTLED_MM, settle_floor
 from tubepose.profile.kernels import grouped
 from tubepose.profile.leftovers import Leftover, find_leftovers
@@ -22,7 +23,7 @@ from tubepose.profile.standing import Standing, gather_standing
 from tubepose.profile.tops import top_radius_m
 from tubepose.profile.verdict import rejection, score
 from tubepose.profile.wall import wall_evidence
-from tubepose.transforms import FloatArray, axis_rotations
+from tubepose.transforms import FloatArray, axis_rotations, transform_points
 from tubepose.tube import TubePose, TubeStatus
 
 
@@ -55,6 +56,7 @@ def fit_profiles(
     *,
     rack_covariance: FloatArray | None = None,
     allowed: NDArray[np.bool_] | None = None,
+    bow: FaceBow | None = None,
 ) -> tuple[ProfileTube, ...]:
     """Poses of all tubes of a frame.
 
@@ -67,16 +69,57 @@ def fit_profiles(
         config: Sections profile and slots are used.
         rack_covariance: Of the rack's pose, shape (6, 6), as `RackPose.covariance`; None counts as exact.
         allowed: Which type may stand in which slot, shape (K, S), where a detector says; all by default.
+        bow: Of the rack's face; None counts as flat.
 
     Returns:
         Tubes by slot, then what is left over; without types, all that stands there is.
     """
+    if tubes and rack.floor_tolerance_mm > SETTLED_MM:
+        rack = settle_floor(_all_standing(frame, intrinsics, T_camera_rack, rack, config), rack, tubes, config.profile)
+    if bow is None or not bow.bow_m.any():
+        return _fit_flat(frame, intrinsics, T_camera_rack, rack, tubes, config, rack_covariance, allowed)
+    found: list[ProfileTube] = []
+    for index in range(len(rack.all_slots)):
+        local = slot_frame(rack, index, bow, rack_covariance)
+        may = None if allowed is None else allowed[:, local.rows]
+        there = _fit_flat(
+            frame, intrinsics, T_camera_rack @ local.T_rack_local, local.rack, tubes, config, local.covariance, may
+        )
+        found += [_of_rack(tube, local) for tube in there if _is_of(tube, local.rack)]
+    return (*(tube for tube in found if tube.tube is not None), *(tube for tube in found if tube.tube is None))
+
+
+def _is_of(tube: ProfileTube, local: RackModel) -> bool:
+    """Whether something belongs to the first slot of a neighbourhood and not to its neighbours."""
+    if tube.slot is not None:
+        return tube.slot == local.all_slots[0].name
+    middle = tube.points_m[:, :2].mean(axis=0)
+    return bool(np.linalg.norm(local.slot_centers_m - middle, axis=1).argmin() == 0)
+
+
+def _of_rack(tube: ProfileTube, local: SlotFrame) -> ProfileTube:
+    """Something of a slot's frame, in the rack's frame."""
+    points_m = transform_points(local.T_rack_local, tube.points_m)
+    T = tube.pose.T_rack_tube
+    pose = tube.pose if T is None else replace(tube.pose, T_rack_tube=in_rack_frame(T, local))
+    return replace(tube, points_m=points_m, pose=pose)
+
+
+def _fit_flat(
+    frame: RgbdFrame,
+    intrinsics: CameraIntrinsics | None,
+    T_camera_rack: FloatArray,
+    rack: RackModel,
+    tubes: Sequence[TubeModel],
+    config: Config,
+    rack_covariance: FloatArray | None,
+    allowed: NDArray[np.bool_] | None,
+) -> tuple[ProfileTube, ...]:
+    """Poses of all tubes in a rack with a flat face; arguments as of `fit_profiles`."""
     if not tubes:
         standing = _all_standing(frame, intrinsics, T_camera_rack, rack, config)
         unknown = find_leftovers(standing, np.full(len(standing.points_m), -1), (), rack, ())
         return tuple(_no_tube(left, standing, rack) for left in unknown)
-    if rack.floor_tolerance_mm > SETTLED_MM:
-        rack = settle_floor(_all_standing(frame, intrinsics, T_camera_rack, rack, config), rack, tubes, config.profile)
     measured = measure_tops(frame, intrinsics, T_camera_rack, rack, tubes, config, allowed)
     models = [tubes[k] for k in measured.tops.tube]
     leftovers = find_leftovers(measured.points, measured.label, measured.tops.slot.tolist(), rack, tubes)

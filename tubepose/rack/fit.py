@@ -17,7 +17,7 @@ from tubepose.rack import kernels as kernels
 from tubepose.rack import view_kernels as view_kernels
 from tubepose.rack.field import TopField, openings_field, outline_field, top_field
 from tubepose.rack.fit_kernels import INSIDE_M, WIDEST_M
-from tubepose.rack.tops import Level
+from tubepose.rack.tops import FLAT_CHI2, Level
 from tubepose.transforms import FloatArray, make_transform, parts, translation
 
 # Per round: blur of the edges (the first as wide as a coarse start may be off, the last half a pixel of 0.4 mm), and
@@ -37,9 +37,8 @@ HOPELESS_SHARE = 0.35
 # Half widths of the heights that a bowed face is first fitted to: a plane has cut its ends off.
 BOW_WIDTHS_M = np.geomspace(3.0e-3, 0.6e-3, 8)
 # Light that lifts or sinks whole sides of a rack looks like a bow, too (`INFLATE`): a face is flat unless its bow is
-# less likely than one in a thousand by chance (chi-squared of 3).
+# less likely than one in a thousand by chance.
 BOW_INFLATE = 3.0
-FLAT_CHI2 = 16.27
 # Edges are looked for at least this near the top.
 EDGE_WINDOW_M = 1.0e-3
 LEAST_POINTS = 20
@@ -165,16 +164,18 @@ def _near_top(points_m: FloatArray, T_camera_top: FloatArray, rack: RackModel) -
 def refine(state: RoughFit, rack: RackModel) -> Fit:
     """The other rounds; none where so much lies beside the solid part that they are of no use.
 
-    The first of them fits a bow. Where that is not significant, the face is flat.
+    The first of them fits a bow. Where that is not significant, the face is flat. Tops that hold a rack tell its bow, too.
     """
     top, fine = top_field(rack), _thinned(state.kept_m, FINE_POINTS)
     if state.stray <= HOPELESS_SHARE:
-        flat = replace(state)
-        _step(fine, state, top, ROUNDS_M[ROUGH_ROUNDS][0], BOW_WIDTHS_M, tells=True, bowed=True)
-        bowed = _significant(state.bow_m, state.bow_covariance)
-        if not bowed:
-            flat.bow_covariance = state.bow_covariance
-            state = flat
+        bowed = False
+        if state.level is None:
+            flat = replace(state)
+            _step(fine, state, top, ROUNDS_M[ROUGH_ROUNDS][0], BOW_WIDTHS_M, tells=True, bowed=True)
+            bowed = _significant(state.bow_m, state.bow_covariance)
+            if not bowed:
+                flat.bow_covariance = state.bow_covariance
+                state = flat
         for number, (blur_m, widths_m) in enumerate(ROUNDS_M[ROUGH_ROUNDS:], ROUGH_ROUNDS):
             _step(fine, state, top, blur_m, widths_m, tells=number == len(ROUNDS_M) - 1, bowed=bowed)
     covariance = _covariance(state, fine, top)
@@ -210,7 +211,10 @@ def _covariance(state: RoughFit, points_m: FloatArray, field: TopField) -> Float
 
 def leveled(rough: RoughFit, level: Level) -> RoughFit:
     """A rough fit, held level by the tops of what stands in the rack, to go on with."""
-    return replace(rough, T_camera_top=level.T_camera_top, scatter_m=WIDEST_M, level=level)
+    return replace(
+        rough, T_camera_top=level.T_camera_top, scatter_m=WIDEST_M, level=level, bow_m=level.bow_m,
+        bow_covariance=level.bow_covariance,
+    )  # fmt: skip
 
 
 def rack_frame(state: RoughFit, rack: RackModel) -> FloatArray:

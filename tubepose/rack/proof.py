@@ -67,6 +67,8 @@ def _quick(seen: Agreement, fit: Fit, config: RackConfig) -> Iterator[Check]:
         ("beside_outline", seen.outside, config.max_outside_share),
     ):
         yield Check(code, 100 * value, 100 * limit, value <= limit)
+    bow_mm = 1e3 * float(np.abs(fit.bow_m).max())
+    yield Check("bow", bow_mm, config.max_bow_mm, bow_mm <= config.max_bow_mm)
     least = config.min_seen if fit.level is None else config.min_seen_held
     yield Check("little_seen", 100 * seen.coverage, 100 * least, seen.coverage >= least)
     yield Check("not_in_view", 100 * seen.unseen, 100 * config.max_unseen_share, seen.unseen <= config.max_unseen_share)

@@ -24,10 +24,10 @@ from tubepose.transforms import FloatArray, make_transform
 PLANE_SAMPLE = 600
 PLANE_DRAWS = 1500
 # Half thickness of a band before its plane is known well, and after.
-ROUGH_BAND_M = 2.5e-3
-BAND_M = 1.2e-3
+ROUGH_BAND_M = 4.0e-3
+BAND_M = 3.0e-3
 # Points this far below are not of the top.
-BELOW_M = 4e-3
+BELOW_M = 5e-3
 # Directions nearer than this are the same, and peaks of one height.
 SAME_DIRECTION_RAD = 0.05
 SAME_TURN = 4

@@ -20,6 +20,7 @@ from tubepose.labware import RackModel
 from tubepose.preprocessing import thin
 from tubepose.rack import kernels as kernels
 from tubepose.rack.field import top_field
+from tubepose.rack.fit_kernels import BOW_STD_M, bow_at
 from tubepose.transforms import FloatArray, make_transform, parts, translation
 
 # What stands out of a rack is looked for from here to there above its top, and this near the axis of its slot.
@@ -38,11 +39,18 @@ PLATE_SHARE = 0.5
 AREA_STEP_M = 0.5e-3
 # Planes are drawn through three tops; no farther off the level of the ribs than stray light can lift one side of them.
 DRAWS = 200
-STEEPEST = 0.06
+STEEPEST_M = 4e-3
+# Those through tops that are on a line, or nearly, lean as they like.
+LEAST_SPAN = 0.02
+# A face is bowed by no more (real racks: 2 mm), and where so many are on a plane none is looked for.
+MOST_BOW_M = 4e-3
+MOST_ALIKE = 0.8
 # Tops of one kind: caps sit crooked, and bottoms play on the floor. Two kinds that differ by little, in blocks of rows,
 # would make a plane that leans, with rows off it on either side: less likely by chance than this, they are two.
 ALIKE_M = 0.4e-3
 LEAST_CHANCE = 1e-3
+# A bow is one if it is less likely by chance than one in a thousand (chi-squared of 3).
+FLAT_CHI2 = 16.27
 # So many of one kind hold a rack, if its level is known as well by them.
 LEAST_TOPS = 12
 LARGEST_STD_RAD = 3e-3
@@ -62,12 +70,16 @@ class Level:
     Attributes:
         T_camera_top: Frame of the rack's top, turned level with them, shape (4, 4), metres.
         covariance: Of its turns about x and y, shape (2, 2), rad^2.
-        count: How many tops are on one plane.
+        count: How many tops are on one surface.
+        bow_m: Of that surface, and so of the face, shape (3,), metres (`Fit.bow_m`); 0 where it is not significant.
+        bow_covariance: Of that, shape (3, 3).
     """
 
     T_camera_top: FloatArray
     covariance: FloatArray
     count: int
+    bow_m: FloatArray
+    bow_covariance: FloatArray
 
 
 def level_by_tops(points_m: FloatArray, ribs_m: FloatArray, T_camera_top: FloatArray, rack: RackModel) -> Level | None:
@@ -82,26 +94,49 @@ def level_by_tops(points_m: FloatArray, ribs_m: FloatArray, T_camera_top: FloatA
     centers, heights, plate = _tops(points_m, T_camera_top, rack)
     if plate or len(centers) < LEAST_TOPS:
         return None
-    alike = _one_kind(centers, heights)
+    half_m = rack.outline_m / 2
+    alike = _one_kind(centers / half_m, heights)
     if np.count_nonzero(alike) < LEAST_TOPS:
         return None
-    turns, covariance, off = _level(centers[alike], heights[alike])
-    if np.sqrt(np.diag(covariance).max()) > LARGEST_STD_RAD or _rows_differ(centers[alike], off):
+    found, covariance, off = _surface(centers[alike] / half_m, heights[alike])
+    turns, to_turns = np.array([found[1] / half_m[1], -found[0] / half_m[0]]), np.diag([1 / half_m[1], -1 / half_m[0]])
+    covariance_turns = to_turns @ covariance[np.ix_([1, 0], [1, 0])] @ to_turns.T
+    if np.sqrt(np.diag(covariance_turns).max()) > LARGEST_STD_RAD or _rows_differ(centers[alike], off):
         return None
-    turn = make_transform(Rotation.from_rotvec([*turns, 0.0]).as_matrix(), np.zeros(3))
-    T_level = T_camera_top @ turn
-    T_level = T_level @ translation([0, 0, _height(ribs_m, T_level, rack)])
-    return Level(T_level, covariance, int(alike.sum()))
+    turn = make_transform(Rotation.from_rotvec([*np.arctan(turns), 0.0]).as_matrix(), np.zeros(3))
+    T_level, bow_m = T_camera_top @ turn, found[3:]
+    T_level = T_level @ translation([0, 0, _height(ribs_m, T_level, bow_m, rack)])
+    return Level(T_level, covariance_turns, int(alike.sum()), bow_m, covariance[3:, 3:])
 
 
-def _level(centers_m: FloatArray, heights_m: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Turns about x and y (2,) that put tops (K,) on a level plane, their covariance (2, 2), and what is left (K,)."""
-    design = np.column_stack([centers_m[:, 1], -centers_m[:, 0], np.ones(len(centers_m))])
-    normal = design.T @ design
-    found = np.linalg.solve(normal, design.T @ heights_m)
-    off = heights_m - design @ found
-    variance = float(off @ off) / (len(off) - 3)
-    return np.arctan(found[:2]), INFLATE**2 * variance * np.linalg.inv(normal)[:2, :2], off
+def _terms(uv: FloatArray) -> FloatArray:
+    """Columns of a low-order surface at places (..., 2) that are 1 at the ends of the outline: shape (..., 6)."""
+    u, v = uv[..., 0], uv[..., 1]
+    return np.stack([u, v, np.ones_like(u), u * u, v * v, u * v], axis=-1)
+
+
+def _surface(uv: FloatArray, heights_m: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Surface (6,) of tops (K,), its covariance (6, 6) and what is left (K,); a plane where a bow is not significant.
+
+    The bow has the prior of a rack's face.
+    """
+    fits = []
+    for bowed in (True, False):
+        design = _terms(uv)
+        prior = np.diag([0, 0, 0, *np.full(3, (ALIKE_M / (2 * BOW_STD_M)) ** 2 if bowed else 1e9)])
+        normal = design.T @ design + prior
+        found = np.linalg.solve(normal, design.T @ heights_m)
+        off = heights_m - design @ found
+        spare = max(len(off) - (6 if bowed else 3), 1)
+        fits.append((found, INFLATE**2 * float(off @ off) / spare * np.linalg.inv(normal), off))
+    bowed_fit, flat_fit = fits
+    bow = bowed_fit[0][3:]
+    significant = bow @ np.linalg.solve(bowed_fit[1][3:, 3:], bow) > FLAT_CHI2
+    if significant:
+        return bowed_fit
+    found, covariance, off = flat_fit
+    covariance[3:, 3:] = bowed_fit[1][3:, 3:]
+    return np.concatenate([found[:3], np.zeros(3)]), covariance, off
 
 
 def _rows_differ(centers_m: FloatArray, off_m: FloatArray) -> bool:
@@ -148,22 +183,35 @@ def _between(rack: RackModel) -> tuple[FloatArray, FloatArray]:
     return between_m, np.asarray(np.bincount(beyond, minlength=len(between_m)) * AREA_STEP_M**2)
 
 
-def _one_kind(centers_m: FloatArray, heights_m: FloatArray) -> NDArray[np.bool_]:
-    """Which of the tops (K,) are on the plane that most of them are on, if it is nearly level."""
+def _one_kind(uv: FloatArray, heights_m: FloatArray) -> NDArray[np.bool_]:
+    """Which of the tops (K,) are on the surface that most of them are on, if it is nearly level and bowed as racks are.
+
+    Planes are drawn through three tops first, and surfaces through six where planes leave too many.
+    """
     rng = np.random.default_rng(0)
-    three = rng.integers(0, len(centers_m), (DRAWS, 3))
-    places = np.concatenate([centers_m, np.ones((len(centers_m), 1))], axis=1)
-    corners = places[three]
-    apart = np.abs(np.linalg.det(corners)) > 1e-4 * np.ptp(centers_m, axis=0).max()
-    planes = np.linalg.solve(corners[apart], heights_m[three[apart], None])[..., 0]
-    planes = planes[np.hypot(planes[:, 0], planes[:, 1]) < STEEPEST]
-    alike = np.abs(planes @ places.T - heights_m) < ALIKE_M
-    return alike[alike.sum(axis=1).argmax()] if len(alike) else np.zeros(len(centers_m), bool)
+    places = _terms(uv)
+    best = np.zeros(len(uv), bool)
+    for count in (3, 6):
+        few = rng.integers(0, len(uv), (DRAWS * count // 3, count))
+        corners = places[few][..., :count]
+        apart = np.abs(np.linalg.det(corners)) > LEAST_SPAN
+        if not apart.any():
+            continue
+        surfaces = np.linalg.solve(corners[apart], heights_m[few[apart], None])[..., 0]
+        level = np.hypot(surfaces[:, 0], surfaces[:, 1]) < STEEPEST_M
+        level &= np.all(np.abs(surfaces[:, 3:]) < MOST_BOW_M, axis=1)
+        alike = np.abs(surfaces[level] @ places[:, :count].T - heights_m) < ALIKE_M
+        if len(alike) and alike.sum(axis=1).max() > best.sum():
+            best = alike[alike.sum(axis=1).argmax()]
+        if best.sum() > MOST_ALIKE * len(uv):
+            break
+    return best
 
 
-def _height(ribs_m: FloatArray, T_camera_top: FloatArray, rack: RackModel) -> float:
+def _height(ribs_m: FloatArray, T_camera_top: FloatArray, bow_m: FloatArray, rack: RackModel) -> float:
     """Height of the ribs that show, over the level of a frame: that of the highest peak that counts."""
-    solid_m = top_field(rack).on_solid(ribs_m, T_camera_top, PEAK_REACH_M)
+    solid_m = top_field(rack).on_solid(ribs_m, T_camera_top, 2 * PEAK_REACH_M)
+    solid_m[:, 2] -= bow_at(bow_m, *(solid_m[:, :2] / (rack.outline_m / 2)).T)
     edges = np.arange(-PEAK_REACH_M, PEAK_REACH_M + PEAK_BIN_M / 2, PEAK_BIN_M)
     counts = np.convolve(np.histogram(solid_m[:, 2], edges)[0], [0.5, 1, 1, 1, 0.5], "same")
     padded = np.pad(counts, 1)
