@@ -86,7 +86,7 @@ def test_a_wrong_box_of_the_network_gets_a_second_opinion_and_the_row_says_so(fr
     scene = prepare_scene(frame, RACK, TUBES, detector, CONFIG, hint_for(T_CAMERA_RACK))
     assert scene.rack_pose.status is RackStatus.OK
     row = rack_row(scene)
-    assert [entry.stage for entry in scene.times] == ["detect", "rack", "slots"]
+    assert [entry.stage for entry in scene.times] == ["detect", "rack", "sensor", "slots"]
     assert row["box_source"] == "geometric"
     assert row["box_note"].startswith("no rack in the network's box")
     assert np.allclose(

@@ -41,7 +41,7 @@ from tubepose.records import (
 from tubepose.simulation import SceneVariation
 from tubepose.transforms import FloatArray
 from tubepose.uncertainty import COVERAGE_COLUMNS, UNCERTAINTY_COLUMNS
-from tubepose_cli.show import describe_tubes, progress
+from tubepose_cli.show import describe_noise, describe_tubes, progress
 
 KNOWN = ("--rack", SMALL_RACK, "--tubes", SMALL_TUBES[1])
 DOCS = Path(__file__).parents[1] / "docs" / "outputs.md"
@@ -118,6 +118,36 @@ def test_estimate_writes_exactly_these_columns(estimated: tuple[Path, Ended]) ->
     assert columns(out / "slots.csv") == list(SLOT_COLUMNS)
     assert columns(out / "estimates.csv") == list(ESTIMATE_COLUMNS)
     assert columns(out / "timings.csv") == list(TIMING_COLUMNS)
+
+
+def test_every_frame_has_its_noise_and_the_run_says_it_in_one_line(estimated: tuple[Path, Ended]) -> None:
+    out, ended = estimated
+    sensor = table(out / "sensor.csv")
+    assert len(sensor) == 2
+    assert (sensor[["independent_m", "spacing_m", "cap_slope_std", "cap_height_std_m"]] > 0).all(axis=None)
+    (line,) = [line for line in ended.err.splitlines() if line.startswith("depth noise: ")]
+    assert " mm independent, " in line
+
+
+def test_noise_in_one_line_is_the_median_and_says_where_it_was_measured() -> None:
+    prior = {
+        "source": "prior", "independent_m": 9e-3, "shared_m": 9e-3, "correlation_m": 9e-3, "n_patches": 0,
+        "edge_source": "prior", "edge_blur_px": 1.0, "note": "the rack's pose is not known",
+    }  # fmt: skip
+    seen = {
+        "source": "table", "independent_m": 8e-5, "shared_m": 2e-5, "correlation_m": 3e-3, "n_patches": 142,
+        "edge_source": "rack_outline", "edge_blur_px": 0.5, "note": "",
+    }  # fmt: skip
+    words = "depth noise: 0.08 mm independent, 0.02 mm shared over 3 mm"
+    assert describe_noise([seen]) == f"{words} (measured on the table, 142 patches), edges 0.5 px"
+    several = describe_noise([seen, prior, {**seen, "independent_m": 8.2e-5, "note": "odd"}])
+    assert (
+        several == "depth noise: 0.081 mm independent, 0.02 mm shared over 3 mm "
+        "(measured on the table in 2 of 3 frames, 142 patches), edges 0.5 px; odd"
+    )
+    assert describe_noise([prior]) == (
+        "depth noise: 9 mm independent, 9 mm shared over 9 mm (assumed, not measured), edges 1.0 px (assumed)"
+    )
 
 
 def test_every_slot_is_listed_and_the_filled_ones_are_the_declared(

@@ -181,6 +181,7 @@ def test_without_a_table_the_racks_top_tells(noise: DepthNoise) -> None:
     frame = noisy(noise)
     found, with_table = measure(beside_alone(frame, keep_table=False)), measure(frame)
     assert (found.source, found.outlier_source, found.edge_source) == ("rack_top", "prior", "prior")
+    assert "no table is seen" in found.note
     expected = with_table.slope_std(CAP_M, found.distance_m)
     # Both depths have the same law here, and the table's noise is scaled to the nearer one: 20 % less.
     scale = with_table.distance_m / found.distance_m

@@ -22,6 +22,8 @@ COMPARED_M = 6.5e-3
 SURE = 2.0
 """Standard deviations by which a surface's noise must be known before another one's is doubted for it."""
 ASKED_POINTS = 400
+UPPER_BOUND = "no table is seen: stray light on the rack's ribs counts as noise, so caps may have less"
+"""What is said of a rack's top that is alone: light from slots and tubes bends ribs, and caps stand above it."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -101,7 +103,7 @@ def _believed(beside: _Source | None, above: _Source | None, config: SensorConfi
     if beside is None and above is None:
         return prior_noise(config, "no level surface was seen beside the rack or on its top")
     if beside is None or above is None:
-        return _noise(beside or above, config, "")
+        return _noise(beside or above, config, UPPER_BOUND if beside is None else "")
     of_table, of_top = _noise(beside, config, ""), _noise(above, config, "")
     depth = of_top.distance_m
     here, there = of_table.slope_std(COMPARED_M, depth), of_top.slope_std(COMPARED_M, depth)

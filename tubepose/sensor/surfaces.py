@@ -26,7 +26,8 @@ LEAST_SIGMA_M = 2e-5
 """No sensor is better: points of a perfect surface must not be thrown out for rounding."""
 CLIP = 4.0
 """Points farther off than this many standard deviations are not of the surface (normal errors: 1 of 16 000)."""
-FITTED_POINTS = 20_000
+FITTED_POINTS = 6_000
+"""Points that tell what is of the surface; all of them then tell where it lies."""
 STEP_M = 1e-3
 """Points this far off a plane can be of it without any noise: the coarsest step in which cameras publish depth."""
 DRAWS, DRAWN_FROM = 100, 1000
