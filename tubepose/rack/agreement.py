@@ -8,17 +8,15 @@ has all of the ribs, and little of a tube's wall that crosses it or of light in 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import lru_cache
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from tubepose.config import RackConfig
 from tubepose.labware import RackModel
 from tubepose.rack import view_kernels as view_kernels
 from tubepose.rack.evidence import evidence_of
-from tubepose.rack.field import GRID_M, PICTURE_M, picture, top_field
+from tubepose.rack.field import PICTURE_M, picture, top_field
 from tubepose.rack.fit import LEAST_POINTS, Fit, RoughFit, camera_place, label, rack_frame, top_frame
 from tubepose.transforms import FloatArray, parts
 

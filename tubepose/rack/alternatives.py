@@ -195,9 +195,7 @@ def _fits(rack: RackModel, slots: list[SlotModel]) -> bool:
     return all(np.all(np.abs(slot.center_mm) + np.array(slot.size_mm) / 2 < half) for slot in slots)
 
 
-def _to_outline_m(
-    rack: RackModel, grid: Grid, side: tuple[int, int] = (0, 0), more_m: float = 0.0
-) -> FloatArray:
+def _to_outline_m(rack: RackModel, grid: Grid, side: tuple[int, int] = (0, 0), more_m: float = 0.0) -> FloatArray:
     """Signed distance of cells from the inside of the outline, shape (X * Y,); one side so much farther out."""
     xy, half = grid.centers_m, rack.outline_m / 2
     shift = np.array(side) * more_m / 2

@@ -220,6 +220,8 @@ def _pose(
         level_tops=0 if why else chosen.level_tops,
         covariance=None if why else chosen.covariance,
         checks=turns[0].checks,
+        size=chosen.size,
+        floor_m=chosen.floor_m,
         bow_m=None if why else chosen.bow_m,
         bow_std_m=None if why else chosen.bow_std_m,
     )

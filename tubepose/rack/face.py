@@ -130,7 +130,10 @@ class Face:
         """
         solid, opened = (distance_m.reshape(self.grid.shape) * sign > INNER_M for sign in (-1, 1))
         hidden, dark = (
-            [_rate(self.nothing & cells & zone, self.seen & cells & zone, NOTHING) for zone in (~self.shaded, self.shaded)]
+            [
+                _rate(self.nothing & cells & zone, self.seen & cells & zone, NOTHING)
+                for zone in (~self.shaded, self.shaded)
+            ]
             for cells in (solid, opened)
         )
         clear, below = opened & self.seen & ~self.standing, opened & self.seen & self.standing

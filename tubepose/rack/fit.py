@@ -100,9 +100,7 @@ class Fit:
             return points_m
         T = top_frame(self.T_camera_rack, rack)
         points_m = np.ascontiguousarray(points_m, float)
-        return np.asarray(
-            fit_kernels.laid_flat(points_m, *parts(T), camera_place(T), rack.outline_m / 2, self.bow_m)
-        )
+        return np.asarray(fit_kernels.laid_flat(points_m, *parts(T), camera_place(T), rack.outline_m / 2, self.bow_m))
 
 
 @dataclass(slots=True, eq=False)

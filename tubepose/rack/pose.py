@@ -7,6 +7,7 @@ from enum import StrEnum
 
 from tubepose.checks import Check
 from tubepose.labware import RackModel
+from tubepose.rack.size import FaceSize
 from tubepose.transforms import FloatArray
 
 MIN_POINTS = 50
@@ -47,6 +48,9 @@ class RackPose:
         level_tops: How many tops of what stands in it hold it level; 0 where its own top tells.
         hint_note: Why a hint that was given decided nothing, where one was needed; empty otherwise.
         checks: What the registration had to pass; empty from a method that has none, and without a registration.
+        size: What the sizes of its face are measured to be; None from a method that does not measure them.
+        floor_m: Height at which the slots' floor is seen above the rack's base and its standard deviation, metres; None
+            where it is not seen.
         bow_m: How much higher the face is than the plane at its centre, shape (3,), metres: at the ends of its x axis, of
             its y axis, and what its corners have besides: b(x, y) = bow_x u^2 + bow_y v^2 + bow_xy u v, u = 2 x / length, v =
             2 y / width. None without a pose, and from a method that takes every face for flat.
@@ -72,5 +76,7 @@ class RackPose:
     hint_note: str = ""
     level_tops: int = 0
     checks: tuple[Check, ...] = ()
+    size: FaceSize | None = None
+    floor_m: tuple[float, float] | None = None
     bow_m: FloatArray | None = None
     bow_std_m: FloatArray | None = None

@@ -37,8 +37,8 @@ FLOOR_STD_M = 0.3e-3
 
 def prove(
     points_m: FloatArray, fit: Fit, seen: Agreement, rack: RackModel, config: RackConfig
-) -> tuple[tuple[Check, ...], FaceSize | None]:
-    """Every check of a registration, and the sizes of its face; without them where a quick look fails.
+) -> tuple[tuple[Check, ...], FaceSize | None, tuple[float, float] | None]:
+    """Every check of a registration, the sizes of its face, and its floor; without them where a quick look fails.
 
     Args:
         points_m: Points near the rack, camera frame, shape (N, 3), metres; of a bowed rack those that were laid flat.
@@ -49,14 +49,15 @@ def prove(
     """
     checks = tuple(_quick(seen, fit, config))
     if failed(checks):
-        return checks, None
+        return checks, None, None
     window_m = float(np.clip(fit.scatter_m, *JUDGED_M))
     grid = face_grid(rack, seen.spacing_m, BESIDE_M)
     face = look_at_face(points_m, fit.T_camera_rack, rack, window_m, grid, seen.spacing_m)
     size = measure_size(face, rack)
     distance_m = float(np.linalg.norm(top_frame(fit.T_camera_rack, rack)[:3, 3]))
     checks += (*_alternatives(face, rack, config), *_beside(face, rack), *_sizes(size, rack, config))
-    return (*checks, *_scale(size, rack, distance_m, config), *_floor(points_m, fit, rack, config)), size
+    floor_m = measure_floor(points_m, fit, rack)
+    return (*checks, *_scale(size, rack, distance_m, config), *_floor(floor_m, rack, config)), size, floor_m
 
 
 def _quick(seen: Agreement, fit: Fit, config: RackConfig) -> Iterator[Check]:
@@ -142,8 +143,7 @@ def _scale(size: FaceSize, rack: RackModel, distance_m: float, config: RackConfi
     yield Check("scale", 100 * abs(scale), 100 * limit, abs(scale) - 3 * std <= limit, detail=words)
 
 
-def _floor(points_m: FloatArray, fit: Fit, rack: RackModel, config: RackConfig) -> Iterator[Check]:
-    measured = measure_floor(points_m, fit, rack)
+def _floor(measured: tuple[float, float] | None, rack: RackModel, config: RackConfig) -> Iterator[Check]:
     if measured is None:
         return
     off_mm, std_mm = 1e3 * (measured[0] - rack.floor_m), 1e3 * measured[1]

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from tubepose.checks import Check, reason
 from tubepose.config import RackConfig
 from tubepose.labware import RackModel
-from tubepose.checks import Check, reason
 from tubepose.rack.agreement import Agreement, coverage, measure_agreement
 from tubepose.rack.fit import HOPELESS_SHARE, Fit, RoughFit, at_the_top, leveled, refine, top_frame
 from tubepose.rack.looks import SLOT_STEPS, look_at, on_lattice
@@ -34,6 +34,7 @@ class Registration:
         checks: What it had to pass.
         name: Of the rack.
         size: What the face's sizes are measured to be; None where a quick look had failed.
+        floor_m: Height of the slots' floor and its standard deviation, metres; None where it was not seen.
     """
 
     fit: Fit
@@ -41,6 +42,7 @@ class Registration:
     checks: tuple[Check, ...]
     name: str
     size: FaceSize | None = None
+    floor_m: tuple[float, float] | None = None
 
     @property
     def reason(self) -> str:
@@ -116,5 +118,5 @@ def _refined(near_m: FloatArray, rough: RoughFit, rack: RackModel, config: RackC
     fit = refine(rough, rack)
     flat_m = fit.laid_flat(near_m, rack)
     agreement = measure_agreement(flat_m, fit, rack, config)
-    checks, size = prove(flat_m, fit, agreement, rack, config)
-    return Registration(fit, agreement, checks, rack.name, size)
+    checks, size, floor_m = prove(flat_m, fit, agreement, rack, config)
+    return Registration(fit, agreement, checks, rack.name, size, floor_m)

@@ -58,6 +58,12 @@ class FaceSize:
         value = self.openings_m + float(self.outline_m.mean())
         return value, float(np.sqrt(pick @ self.covariance @ pick))
 
+    def quarter_turned(self) -> FaceSize:
+        """The same with x and y changed."""
+        order = [1, 0, 2, 4, 3]
+        covariance = self.covariance[np.ix_(order, order)]
+        return FaceSize(self.stretch[::-1], self.openings_m, self.outline_m[::-1], covariance)
+
 
 def measure_size(face: Face, rack: RackModel) -> FaceSize:
     """Measure a face; what is not seen stays as defined, with the prior's standard deviation.

@@ -77,7 +77,9 @@ def size_step(xy_m, solid, missed, wrong, weight, found, blur_m, low_m, cell_m, 
 
 
 @compiled
-def sizes(xy_m, solid, missed, wrong, weight, blurs_m, rounds, prior, longest, side_m, low_m, cell_m, shape, openings, outline):
+def sizes(
+    xy_m, solid, missed, wrong, weight, blurs_m, rounds, prior, longest, side_m, low_m, cell_m, shape, openings, outline
+):
     """Fisher scoring from 0 with a Gaussian prior (information (8,)): unknowns (8,), covariance (8, 8), squares.
 
     The blur narrows round by round; no step is longer than `longest` (8,). The covariance is that of residuals alike

@@ -15,6 +15,7 @@ from tubepose.labware import RackModel
 from tubepose.rack.agreement import Agreement, measure_agreement
 from tubepose.rack.field import top_field
 from tubepose.rack.settling import Registration, register_at
+from tubepose.rack.size import FaceSize
 from tubepose.transforms import HALF_TURN, QUARTER_TURN, FloatArray, transform_points
 
 
@@ -30,6 +31,8 @@ class Turn:
         checks: What it had to pass.
         bow_m: Of its face, shape (3,), along the turned frame's axes, metres; see `Fit.bow_m`.
         bow_std_m: Standard deviations of that.
+        size: Sizes of its face along the turned frame's axes; None where they were not measured.
+        floor_m: Height of the slots' floor and its standard deviation, metres; None where it was not seen.
     """
 
     T_camera_rack: FloatArray
@@ -39,6 +42,8 @@ class Turn:
     checks: tuple[Check, ...]
     bow_m: FloatArray
     bow_std_m: FloatArray
+    size: FaceSize | None
+    floor_m: tuple[float, float] | None
 
 
 def turns_of(best: Registration, points_m: FloatArray, rack: RackModel, config: RackConfig) -> list[Turn]:
@@ -63,6 +68,7 @@ def turns_of(best: Registration, points_m: FloatArray, rack: RackModel, config: 
 def _turn(registration: Registration, T_registered_turned: FloatArray) -> Turn:
     fit = registration.fit
     axes = np.kron(np.eye(2), T_registered_turned[:3, :3])
+    quarter = abs(T_registered_turned[0, 0]) < 0.5
     return Turn(
         fit.T_camera_rack @ T_registered_turned,
         np.asarray(axes.T @ fit.covariance @ axes),
@@ -71,6 +77,8 @@ def _turn(registration: Registration, T_registered_turned: FloatArray) -> Turn:
         registration.checks,
         _bow_turned(fit.bow_m, T_registered_turned),
         np.abs(_bow_turned(fit.bow_std_m, T_registered_turned)),
+        registration.size if registration.size is None or not quarter else registration.size.quarter_turned(),
+        registration.floor_m,
     )
 
 
