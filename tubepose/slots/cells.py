@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,8 +25,22 @@ SLENDER = 0.7
 an opening of 16.5 mm. Thinner things lean and need a rack of their own."""
 LEAST_CORE = 0.1
 """Least radius of a slot's core, as a share of its width: smaller discs hold less than one cell."""
-LEVELS = 8
+LEVELS = 5
 """Heights at which the core of a slot is looked for along a line of sight."""
+
+
+class OpeningSizes(NamedTuple):
+    """Sizes of a rack's openings, in the order of its slots.
+
+    Attributes:
+        half_m: Half of each opening along x and y, shape (S, 2), metres.
+        width_m: Width across its narrow side, shape (S,), metres.
+        is_round: Which are round, shape (S,).
+    """
+
+    half_m: FloatArray
+    width_m: FloatArray
+    is_round: NDArray[np.bool_]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -48,6 +63,13 @@ class OpeningCells:
     owner: NDArray[np.intp]
     center_m: FloatArray
     slot: NDArray[np.intp]
+
+
+@lru_cache(maxsize=16)
+def opening_sizes(rack: RackModel) -> OpeningSizes:
+    """Sizes of all openings of a rack."""
+    half = np.array([slot.half_size_m for slot in rack.all_slots])
+    return OpeningSizes(half, 2 * half.min(axis=1), np.array([slot.shape == "round" for slot in rack.all_slots]))
 
 
 @lru_cache(maxsize=16)
@@ -83,8 +105,8 @@ def empty_height_m(cells: OpeningCells, rack: RackModel, camera_m: FloatArray) -
         camera_m: Place of the camera, rack frame, shape (3,), metres; above the face.
     """
     nearer = cells.cell_m / np.sqrt(2) + EDGE_M
-    half = np.array([slot.half_size_m for slot in rack.all_slots])[cells.slot] - nearer
-    is_round = np.array([slot.shape == "round" for slot in rack.all_slots])[cells.slot]
+    sizes = opening_sizes(rack)
+    half, is_round = sizes.half_m[cells.slot] - nearer, sizes.is_round[cells.slot]
     q = cells.center_m - rack.slot_centers_m[cells.slot]
     # Shift to the side per metre of descent.
     g = (cells.center_m - camera_m[:2]) / (camera_m[2] - rack.height_m)
@@ -112,8 +134,8 @@ def core_radius_m(rack: RackModel, tubes: Sequence[TubeModel]) -> tuple[FloatArr
         Radius at the face, shape (S,), metres, at least `LEAST_CORE` of the width; and what it loses per metre above
         the face, shape (S,).
     """
-    widths = np.array([2 * slot.half_size_m.min() for slot in rack.all_slots])
-    diagonal = np.array([1.0 if slot.shape == "round" else np.sqrt(2.0) for slot in rack.all_slots])
+    sizes = opening_sizes(rack)
+    widths, diagonal = sizes.width_m, np.where(sizes.is_round, 1.0, np.sqrt(2.0))
     bodies = [2 * tube.body_radius_m(rack.depth_m) for tube in tubes]
     body = np.minimum(min(bodies), widths) if bodies else SLENDER * widths
     off = diagonal * (widths - body) / 2

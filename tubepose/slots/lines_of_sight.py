@@ -11,7 +11,7 @@ from tubepose.capture.frame import CameraIntrinsics, RgbdFrame
 from tubepose.labware import RackModel
 from tubepose.preprocessing import TALLEST_TUBE_M, thin
 from tubepose.slots.cells import OpeningCells, empty_height_m, opening_cells
-from tubepose.slots.sight_kernels import PASSED, Heights, Pixels, follow_lines
+from tubepose.slots.sight_kernels import KINDS, PASSED, Heights, Pixels, follow_lines
 from tubepose.transforms import FloatArray, invert_transform, parts, transform_points
 
 LEAST_CELL_M = 1.0e-3
@@ -88,12 +88,13 @@ def follow_sight(
     counts, covered = follow_lines(
         pixels, rotation, camera_m, heights, cells.low_m, cells.cell_m, cells.owner, empty_m
     )  # fmt: skip
-    shares = counts / np.maximum(counts.sum(axis=2, keepdims=True), 1)
+    number = np.maximum(counts @ np.ones(KINDS), 1)
     openings = cells.cell >= 0
+    kinds = counts[openings] / number[openings][:, None]
     in_image = np.ones(len(cells.slot), bool)
     if intrinsics is not None:
         in_image = _inside_image(cells, rack, intrinsics, T_camera_rack)
-    return FollowedLines(camera_m, cells, shares[openings], shares[..., PASSED], covered[openings], in_image)
+    return FollowedLines(camera_m, cells, kinds, counts[..., PASSED] / number, covered[openings], in_image)
 
 
 def _cell_m(spacing_m: float) -> float:

@@ -47,6 +47,36 @@ class Heights(NamedTuple):
 
 
 @compiled
+def place_of(x_m, y_m, low_m, cell_m, shape):
+    """Grid place of a point, (x, y); (-1, -1) beside the grid."""
+    x, y = math.floor((x_m - low_m[0]) / cell_m), math.floor((y_m - low_m[1]) / cell_m)
+    if 0 <= x < shape[0] and 0 <= y < shape[1]:
+        return x, y
+    return -1, -1
+
+
+@compiled
+def kind_of(end_m, own, empty_m, heights):
+    """What became of a line of sight that ended at a height; NaN where it did not return.
+
+    Args:
+        end_m: Height of its end, metres.
+        own: Whether its end is in the column of the slot whose opening it crosses.
+        empty_m: Height at which it ends in an empty slot, metres; NaN where it crosses no opening.
+        heights: The `Heights`.
+    """
+    if math.isnan(end_m):
+        return SILENT
+    if end_m > heights.face + heights.band:
+        return STANDING if own else HIDDEN
+    if math.isnan(empty_m):
+        return PASSED
+    if end_m > empty_m + heights.slack:
+        return FILLED
+    return PASSED if end_m < heights.face - heights.band else AT_FACE
+
+
+@compiled
 def follow_lines(pixels, rotation, camera_m, heights, low_m, cell_m, owner, empty_m):
     """What became of lines of sight, by the grid place at which they cross the rack's face.
 
@@ -64,14 +94,13 @@ def follow_lines(pixels, rotation, camera_m, heights, low_m, cell_m, owner, empt
         Number of lines per place and kind, shape (X, Y, 6), where those that cross no opening have passed (they ended
         at the face or below), are hidden or silent; and which places have points above the face, shape (X, Y).
     """
-    counts = np.zeros((*owner.shape, KINDS), np.int32)
+    counts = np.zeros((*owner.shape, KINDS))
     covered = np.zeros(owner.shape, np.bool_)
     fx, fy, cx, cy = pixels.camera_px
-    to_face = heights.face - camera_m[2]
     for i in range(0, pixels.cloud_m.shape[0], pixels.step):
         for j in range(0, pixels.cloud_m.shape[1], pixels.step):
             x, y, z = pixels.cloud_m[i, j, 0], pixels.cloud_m[i, j, 1], pixels.cloud_m[i, j, 2]
-            returned = np.isfinite(z)
+            returned = not math.isnan(z)
             if not returned:
                 if fx == 0:
                     continue
@@ -79,37 +108,22 @@ def follow_lines(pixels, rotation, camera_m, heights, low_m, cell_m, owner, empt
             right = rotation[0, 0] * x + rotation[0, 1] * y + rotation[0, 2] * z
             ahead = rotation[1, 0] * x + rotation[1, 1] * y + rotation[1, 2] * z
             up = rotation[2, 0] * x + rotation[2, 1] * y + rotation[2, 2] * z
-            end = camera_m[2] + up
-            end_x = int(np.floor((camera_m[0] + right - low_m[0]) / cell_m))
-            end_y = int(np.floor((camera_m[1] + ahead - low_m[1]) / cell_m))
-            above = returned and end > heights.face + heights.band
-            ends_in = 0 <= end_x < owner.shape[0] and 0 <= end_y < owner.shape[1]
-            if above and ends_in:
-                covered[end_x, end_y] = True
+            end, end_x, end_y = np.nan, -1, -1
+            if returned:
+                end = camera_m[2] + up
+                end_x, end_y = place_of(camera_m[0] + right, camera_m[1] + ahead, low_m, cell_m, owner.shape)
+                if end > heights.face + heights.band and end_x >= 0:
+                    covered[end_x, end_y] = True
             # A line that goes up crosses nothing.
-            if up >= 0:
-                continue
-            along = to_face / up
-            at_x = int(np.floor((camera_m[0] + right * along - low_m[0]) / cell_m))
-            at_y = int(np.floor((camera_m[1] + ahead * along - low_m[1]) / cell_m))
-            if not (0 <= at_x < owner.shape[0] and 0 <= at_y < owner.shape[1]):
-                continue
-            empty = empty_m[at_x, at_y]
-            opening = np.isfinite(empty)
-            if not returned:
-                kind = SILENT
-            elif above:
-                own = opening and ends_in and owner[end_x, end_y] == owner[at_x, at_y]
-                kind = STANDING if own else HIDDEN
-            elif not opening:
-                kind = PASSED
-            elif end > empty + heights.slack:
-                kind = FILLED
-            elif end < heights.face - heights.band:
-                kind = PASSED
-            else:
-                kind = AT_FACE
-            counts[at_x, at_y, kind] += 1
+            if up < 0:
+                along = (heights.face - camera_m[2]) / up
+                at_x, at_y = place_of(
+                    camera_m[0] + right * along, camera_m[1] + ahead * along, low_m, cell_m, owner.shape
+                )
+                if at_x >= 0:
+                    empty = empty_m[at_x, at_y]
+                    own = end_x >= 0 and owner[end_x, end_y] == owner[at_x, at_y] and not math.isnan(empty)
+                    counts[at_x, at_y, kind_of(end, own, empty, heights)] += 1
     return counts, covered
 
 

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from tubepose.labware import RackModel, TubeModel
-from tubepose.slots.cells import SLENDER, OpeningCells
+from tubepose.slots.cells import SLENDER, OpeningCells, opening_sizes
 from tubepose.slots.sight_kernels import least_passing
 from tubepose.transforms import FloatArray
 
@@ -61,7 +61,7 @@ def contradicting_m2(
 
 
 def _outline(rack: RackModel, tube: TubeModel | None) -> Outline:
-    widths = np.array([2 * slot.half_size_m.min() for slot in rack.all_slots])
+    widths = opening_sizes(rack).width_m
     if tube is None:
         return Outline(np.zeros(1), SLENDER / 2 * widths[None], (1 - SLENDER) / 2 * widths)
     out_m = rack.floor_m + tube.height_m - rack.height_m
