@@ -1,8 +1,8 @@
 """Named alternatives to a rack in a pose: another line of slots, other openings, another pitch, no rack at all.
 
-Each is a hypothesis of which parts of the face are solid. What speaks for it is the difference of the log likelihoods of
-the same cells, nats, maximised over its own parameter: a difference does not depend on how many other cells there are,
-and tells in which respect the file of the rack is wrong.
+Each is a hypothesis of which parts of the face are solid. What speaks for it is the difference of the log likelihoods
+of the same cells, nats, maximised over its own parameter: a difference does not depend on how many other cells there
+are, and tells in which respect the file of the rack is wrong.
 """
 
 from __future__ import annotations
@@ -56,8 +56,8 @@ class Gain:
         code: Of the alternative.
         words: What it is.
         nats: Difference of the log likelihoods, negative where the rack is likelier.
-        sigmas: The same over its standard deviation from one square of `CLUSTER_M` to the next (Vuong's test): cells of a
-            square err alike, and one square that is astray proves nothing.
+        sigmas: The same over its standard deviation from one square of `CLUSTER_M` to the next (Vuong's test): cells of
+            a square err alike, and one square that is astray proves nothing.
     """
 
     code: str
@@ -75,16 +75,25 @@ def gains(face: Face, rack: RackModel) -> tuple[Gain, ...]:
     """
     own_m = own_distance_m(rack, face.grid)
     rates = face.rates(own_m)
-    squares, count = _squares(_key(face.grid))
+    square, count = squares(face.grid)
     best: dict[str, Gain] = {}
     for other in alternatives(rack, face.grid):
         more = face.log_likelihood(other.distance_m, rates, other.rows)
         more -= face.log_likelihood(own_m, rates, other.rows)
+        # What was not seen can speak against an alternative, and not for one.
+        nothing = face.nothing.ravel()[other.rows]
+        if more[nothing].sum() > 0:
+            more = np.where(nothing, 0.0, more)
         nats = float(more.sum())
         if other.code not in best or nats > best[other.code].nats:
-            spread = float(np.sqrt((np.bincount(squares[other.rows], more, count) ** 2).sum()))
+            spread = float(np.sqrt((np.bincount(square[other.rows], more, count) ** 2).sum()))
             best[other.code] = Gain(other.code, other.words, nats, nats / max(spread, 1e-9))
     return tuple(best.values())
+
+
+def squares(grid: Grid) -> tuple[NDArray[np.intp], int]:
+    """Which square of `CLUSTER_M` every cell of a grid is in, shape (X * Y,), and how many there are."""
+    return _squares(_key(grid))
 
 
 @lru_cache(maxsize=16)

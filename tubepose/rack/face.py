@@ -1,4 +1,4 @@
-"""What the lines of sight say of a rack's face, cell by cell: a point at its height, one below it, one above it, nothing.
+"""What the lines of sight say of a rack's face, cell by cell: points at its height, below it, above it, or none.
 
 One picture of the face serves every hypothesis of what rack it is. A cell that something above hides says nothing; one
 that is seen says "solid" or "open", and one in which no line of sight ended says little.
@@ -21,7 +21,8 @@ from tubepose.rack.fit_kernels import EDGE_SHIFT_M, WRONG_SHARE
 from tubepose.transforms import FloatArray, parts
 
 # Side of a cell, and how many of the spacings of coarse points it has at least, so that most cells have one.
-CELL_M = 1.0e-3
+CELL_M = 0.7e-3
+CELL_STEP_M = 0.3e-3
 SPACINGS = 1.6
 # Points this far below are seen through the face: floors, and walls of openings. Light sinks few ribs by more.
 SEEN_BELOW_M = 1.5e-3
@@ -31,8 +32,8 @@ SHADOW_M = 20e-3
 BLUR_M = 0.4e-3
 # Points nearer than this share their label's error: they count as one.
 INDEPENDENT_M = 1.5e-3
-# A cell this far from every edge tells how often nothing returns from solid parts, and from open ones.
-INNER_M = 1.0e-3
+# A cell this far from every edge tells how often nothing returns from solid parts (ribs are 1 mm wide), and from open ones.
+INSIDE_M, OPEN_M = 0.4e-3, 1.0e-3
 # Share of cells without a return that is assumed before any were counted, and how many cells an assumption is worth.
 NOTHING, PRIOR_CELLS = 0.3, 20.0
 # An open face with more points than this at its height would be none.
@@ -59,7 +60,8 @@ class Grid:
 def face_grid(rack: RackModel, spacing_m: float, beyond_m: float) -> Grid:
     """Cells from so far beyond the outline on one side to as far beyond it on the other."""
     # Few sizes, so that what is drawn on a grid is drawn once.
-    cell_m = CELL_M * max(1.0, np.ceil(2 * SPACINGS * spacing_m / CELL_M) / 2) if np.isfinite(spacing_m) else CELL_M
+    steps = np.ceil(SPACINGS * spacing_m / CELL_STEP_M) if np.isfinite(spacing_m) else 0.0
+    cell_m = max(CELL_M, steps * CELL_STEP_M)
     half = np.ceil((rack.outline_m / 2 + beyond_m) / cell_m).astype(int)
     return Grid(-half * cell_m, float(cell_m), (int(2 * half[0] + 1), int(2 * half[1] + 1)))
 
@@ -86,6 +88,7 @@ class Face:
 
     Attributes:
         grid: The cells.
+        places_m: Mean place of what was seen in every cell, shape (X, Y, 2), metres; its centre where nothing was.
         solid: Share of the points at the face's height among those at or below it, per cell; NaN where there are none.
         nothing: Cells, between others that have some, in which no line of sight ended at any height.
         standing: Cells above which something stands.
@@ -94,6 +97,7 @@ class Face:
     """
 
     grid: Grid
+    places_m: FloatArray
     solid: FloatArray
     nothing: NDArray[np.bool_]
     standing: NDArray[np.bool_]
@@ -117,8 +121,8 @@ class Face:
             rows: The cells that count, indices into the flattened grid.
         """
         found = view_kernels.cell_logs(
-            self.solid.ravel(), self.nothing.ravel(), self.standing.ravel(), self.shaded.ravel(), distance_m[rows], rows,
-            rates.hidden, rates.dark, rates.stray, rates.crossed, WRONG_SHARE, EDGE_SHIFT_M, BLUR_M,
+            self.solid.ravel(), self.nothing.ravel(), self.standing.ravel(), self.shaded.ravel(), distance_m[rows],
+            rows, rates.hidden, rates.dark, rates.stray, rates.crossed, WRONG_SHARE, EDGE_SHIFT_M, BLUR_M,
         )  # fmt: skip
         return np.asarray(self.weight * found)
 
@@ -128,7 +132,8 @@ class Face:
         Solid parts return more than openings do. Where they do not, as in the shadows between caps, that nothing
         returned says nothing: both rates are then the same.
         """
-        solid, opened = (distance_m.reshape(self.grid.shape) * sign > INNER_M for sign in (-1, 1))
+        distance_m = distance_m.reshape(self.grid.shape)
+        solid, opened = distance_m < -INSIDE_M, distance_m > OPEN_M
         hidden, dark = (
             [
                 _rate(self.nothing & cells & zone, self.seen & cells & zone, NOTHING)
@@ -162,7 +167,7 @@ def look_at_face(
         spacing_m: How far apart points lie.
     """
     T = top_frame(T_camera_rack, rack)
-    counts = view_kernels.face_cells(
+    counts, sums = view_kernels.face_cells(
         np.ascontiguousarray(points_m, float), *parts(T), camera_place(T), grid.low_m, grid.cell_m, grid.shape,
         window_m, max(SEEN_BELOW_M, 2 * window_m),
     )  # fmt: skip
@@ -174,7 +179,8 @@ def look_at_face(
     empty = (told + above + other) == 0
     nothing, shaded = empty & _surrounded(~empty), _beside(above > told, grid.cell_m)
     independent = min(1.0, (max(grid.cell_m, spacing_m) / INDEPENDENT_M) ** 2)
-    return Face(grid, solid, nothing, _footprint(standing > 0, grid.cell_m), shaded, independent)
+    places = np.where(clear[..., None], sums.transpose(1, 2, 0) / np.maximum(told, 1)[..., None], grid.centers_m)
+    return Face(grid, places, solid, nothing, _footprint(standing > 0, grid.cell_m), shaded, independent)
 
 
 def _footprint(standing: NDArray[np.bool_], cell_m: float) -> NDArray[np.bool_]:

@@ -39,6 +39,7 @@ BOW_WIDTHS_M = np.geomspace(3.0e-3, 0.6e-3, 8)
 # Light that lifts or sinks whole sides of a rack looks like a bow, too (`INFLATE`): a face is flat unless its bow is
 # less likely than one in a thousand by chance.
 BOW_INFLATE = 3.0
+LEAST_BOW_M = 1e-5
 # Edges are looked for at least this near the top.
 EDGE_WINDOW_M = 1.0e-3
 LEAST_POINTS = 20
@@ -162,7 +163,8 @@ def _near_top(points_m: FloatArray, T_camera_top: FloatArray, rack: RackModel) -
 def refine(state: RoughFit, rack: RackModel) -> Fit:
     """The other rounds; none where so much lies beside the solid part that they are of no use.
 
-    The first of them fits a bow. Where that is not significant, the face is flat. Tops that hold a rack tell its bow, too.
+    The first of them fits a bow. Where that is not significant, the face is flat. Tops that hold a rack tell its bow,
+    too.
     """
     top, fine = top_field(rack), _thinned(state.kept_m, FINE_POINTS)
     if state.stray <= HOPELESS_SHARE:
@@ -184,7 +186,7 @@ def refine(state: RoughFit, rack: RackModel) -> Fit:
 
 def _significant(bow_m: FloatArray, covariance: FloatArray) -> bool:
     """Whether a bow is one: less likely than this by chance."""
-    return bool(bow_m @ np.linalg.solve(covariance, bow_m) > FLAT_CHI2)
+    return bool(bow_m @ np.linalg.solve(covariance + LEAST_BOW_M**2 * np.eye(3), bow_m) > FLAT_CHI2)
 
 
 def _covariance(state: RoughFit, points_m: FloatArray, field: TopField) -> FloatArray:

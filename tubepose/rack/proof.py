@@ -9,7 +9,7 @@ import numpy as np
 from tubepose.checks import Check, failed
 from tubepose.config import RackConfig
 from tubepose.labware import RackModel
-from tubepose.rack.agreement import JUDGED_M, Agreement
+from tubepose.rack.agreement import Agreement
 from tubepose.rack.alternatives import SIDES, edge_slots, gains, line_steps_m
 from tubepose.rack.face import Face, face_grid, look_at_face
 from tubepose.rack.field import openings_field
@@ -17,6 +17,8 @@ from tubepose.rack.fit import Fit, to_frame, top_frame
 from tubepose.rack.size import FaceSize, measure_size
 from tubepose.transforms import FloatArray
 
+# Half thickness of what counts as the face: so many standard deviations of its heights, between these.
+FACE_SIGMAS, FACE_M = 2.5, (0.4e-3, 1.0e-3)
 # Cells beside the outline that are looked at: a line of slots more.
 BESIDE_M = 30e-3
 # Degrees and millimetres, with their part of a covariance.
@@ -50,7 +52,7 @@ def prove(
     checks = tuple(_quick(seen, fit, config))
     if failed(checks):
         return checks, None, None
-    window_m = float(np.clip(fit.scatter_m, *JUDGED_M))
+    window_m = float(np.clip(FACE_SIGMAS * fit.scatter_m, *FACE_M))
     grid = face_grid(rack, seen.spacing_m, BESIDE_M)
     face = look_at_face(points_m, fit.T_camera_rack, rack, window_m, grid, seen.spacing_m)
     size = measure_size(face, rack)

@@ -44,12 +44,14 @@ def labelled(points_m, rotation, origin_m, camera_m, reach_m, window_m, through_
 def face_cells(points_m, rotation, origin_m, camera_m, low_m, cell_m, shape, window_m, through_m):
     """Points at a frame's plane, below it, above it, and others, counted in cells (5, X, Y); last, what stands there.
 
+    And the sums of places (2, X, Y) of those at the plane or below it.
+
     Points within `window_m` of the plane lie where they are, all others where their line of sight crosses it; above are
     those more than `through_m` higher. Those are counted where they stand, too.
     """
     frame, low_x, low_y = numbers(rotation, origin_m), low_m[0] - 0.5 * cell_m, low_m[1] - 0.5 * cell_m
     camera = (camera_m[0], camera_m[1], camera_m[2])
-    counts = np.zeros((5, shape[0], shape[1]), np.int32)
+    counts, sums = np.zeros((5, shape[0], shape[1]), np.int32), np.zeros((2, shape[0], shape[1]))
     for k in range(len(points_m)):
         right, ahead, up = in_frame(frame, points_m[k, 0], points_m[k, 1], points_m[k, 2])
         if up > 0.9 * camera[2]:
@@ -64,7 +66,10 @@ def face_cells(points_m, rotation, origin_m, camera_m, low_m, cell_m, shape, win
         u, v = (right - low_x) / cell_m, (ahead - low_y) / cell_m
         if 0 <= u < shape[0] and 0 <= v < shape[1]:
             counts[kind, int(u), int(v)] += 1
-    return counts
+            if kind < 2:
+                sums[0, int(u), int(v)] += right
+                sums[1, int(u), int(v)] += ahead
+    return counts, sums
 
 
 @compiled
