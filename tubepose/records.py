@@ -34,6 +34,7 @@ SLOT_COLUMNS = (
     "frame",
     "method",
     "slot",
+    "ambiguous",
     "occupied",
     "tube",
     "share",
@@ -42,8 +43,8 @@ SLOT_COLUMNS = (
     "reason",
 )
 ESTIMATE_COLUMNS = (
-    "session", "trial", "capture", "frame", "timestamp_ns", "method", "seed", "slot", "tube", "status", "reason",
-    "score", *POSE_COLUMNS, "tilt_deg", "inlier_rmse_m", "fitness", "n_points", *COVARIANCE_COLUMNS,
+    "session", "trial", "capture", "frame", "timestamp_ns", "method", "seed", "slot", "tube", "ambiguous", "status",
+    "reason", "score", *POSE_COLUMNS, "tilt_deg", "inlier_rmse_m", "fitness", "n_points", *COVARIANCE_COLUMNS,
 )  # fmt: skip
 TIMING_COLUMNS = (
     "session",
@@ -128,7 +129,14 @@ def slot_rows(keys: Row, method: str, scene: Scene, estimates: Sequence[TubeEsti
     rows = []
     for slot in scene.rack.all_slots:
         estimate = held.get(slot.name)
-        row: Row = {**keys, "method": method, "slot": slot.name, "occupied": estimate is not None, "n_points": 0}
+        row: Row = {
+            **keys,
+            "method": method,
+            "slot": slot.name,
+            "ambiguous": scene.rack_pose.ambiguous,
+            "occupied": estimate is not None,
+            "n_points": 0,
+        }
         if estimate is not None:
             target = estimate.target
             row |= {
@@ -155,6 +163,7 @@ def estimate_row(keys: Row, scene: Scene, estimate: TubeEstimate) -> Row:
         "seed": estimate.seed,
         "slot": target.slot,
         "tube": target.tube.name if target.tube is not None else None,
+        "ambiguous": scene.rack_pose.ambiguous,
         "status": pose.status.value,
         "reason": pose.reason,
         "score": pose.score,
