@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
+from scipy.spatial.transform import Rotation
 
 from tubepose.capture.frame import RgbdFrame
 from tubepose.pipeline import Scene, StageTime, TubeEstimate, best_rack
@@ -74,6 +75,18 @@ def pose_columns(T: FloatArray | None) -> Row:
     if T is None:
         return dict.fromkeys(POSE_COLUMNS, float("nan"))
     return dict(zip(POSE_COLUMNS, (*(float(value) for value in T[:3, 3]), *quaternion_wxyz(T)), strict=True))
+
+
+def transform_of(row: Row) -> FloatArray:
+    """The (4, 4) transform of a pose's columns, tx_m ... qz.
+
+    Raises:
+        ValueError: The row has no pose.
+    """
+    T = np.eye(4)
+    T[:3, :3] = Rotation.from_quat([row[name] for name in ("qx", "qy", "qz", "qw")]).as_matrix()
+    T[:3, 3] = [row[name] for name in ("tx_m", "ty_m", "tz_m")]
+    return T
 
 
 def rack_row(scene: Scene) -> Row:
