@@ -101,6 +101,14 @@ def test_a_direction_between_two_places_decides_nothing():
     assert pointed_at(SlotHint(slot="A1", toward="top-right"), level, UP, None) == 1
 
 
+def test_a_corner_at_which_no_place_is_decides_nothing():
+    """A1 is at the top right or the bottom left of an upright rack; who says top left has mistaken something."""
+    upright = np.array([[45, -90, 600], [-45, 90, 600]]) * 1e-3
+    assert pointed_at(SlotHint(slot="A1", toward="top-left"), upright, UP, None) is None
+    for word in ("top", "top-right", "right"):
+        assert pointed_at(SlotHint(slot="A1", toward=word), upright, UP, None) == 0
+
+
 def test_the_middle_slot_tells_nothing():
     """Its places differ by what a registration errs, and in some direction they always do."""
     places = np.array([[0.0, 0.0, 0.5], [3e-4, 0.0, 0.5]])

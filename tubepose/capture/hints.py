@@ -25,11 +25,16 @@ FORMS = (
     f"{PREVIOUS}, for example A1@412,300 or A1@top-left"
 )
 CLEAR_SHARE = 0.25
-"""A place that a hint means is nearer to it than this share of its distance to each other one; no unit.
+"""A place that a hint means is nearer to it than this share of its distance to each other one; no unit."""
+CLEAR_ANGLE_RAD = math.radians(30)
+"""A place that a word of `Toward` means lies this much nearer to its direction, from the middle of all places.
 
-Of a direction: farther that way than each other one by this share. At a quarter the nearest of the eight words of
-`Toward`, 22.5 deg off at most, tells the four corners of a square rack apart; it would up to 30 deg.
+Of a rack that stands at 90 deg to the word that leaves 15 deg to either side of it open, and the nearest of the eight
+words, 22.5 deg off at most, still tells the four corners of a square rack apart: 22.5 from 67.5 deg.
 """
+CORNER_ANGLE_RAD = math.radians(60)
+"""Farther from the direction of a corner no place is at it: beyond 45 deg it lies on the other side of the rack's middle
+in one of the two ways that the corner names. The rest is for a rack that stands askew."""
 SAME_PLACE_M = 1e-3
 """Places of a slot that are nearer than this are one: the middle slot's, which tells no turns apart.
 
@@ -161,37 +166,57 @@ def pointed_at(
         intrinsics: Of the image that a pixel is of; without them a pixel means none.
     """
     if hint.toward is not None:
-        seen = _seen(openings_m)
-        return _clear(-seen @ _DIRECTIONS[hint.toward], seen, openings_m, near=False)
+        return _towards(hint.toward, openings_m)
     if hint.point_m is not None:
         off = np.array(hint.point_m) - openings_m
         over = off @ normal
         if np.abs(over).min() > HEIGHT_M:
             return None
         across = np.linalg.norm(off - over[:, None] * normal, axis=1)
-        return _clear(across, openings_m, openings_m, near=True)
+        return _near(across, openings_m, openings_m)
     if intrinsics is None:
         return None
     pixels = intrinsics.project(openings_m)
-    return _clear(np.hypot(*(pixels - np.array(hint.pixel)).T), pixels, openings_m, near=True)
+    return _near(np.hypot(*(pixels - np.array(hint.pixel)).T), pixels, openings_m)
 
 
-def _seen(openings_m: FloatArray) -> FloatArray:
-    """Where points (K, 3) are seen in an image of focal length 1, shape (K, 2); NaN behind the camera."""
-    return CameraIntrinsics(1, 1, 1.0, 1.0, 0.0, 0.0).project(openings_m)
-
-
-def _clear(costs: FloatArray, places: FloatArray, openings_m: FloatArray, *, near: bool) -> int | None:
-    """The place of the least cost, if it is clearly that; with `near`, costs are distances, and a far hint means none.
+def _near(distances: FloatArray, places: FloatArray, openings_m: FloatArray) -> int | None:
+    """The place that is near, if it is clearly the nearest.
 
     A hint far from all places is of something else: swapped coordinates, or a pixel of another image.
     """
-    best = int(costs.argmin())
-    others = np.arange(len(costs)) != best
-    margin = CLEAR_SHARE * np.linalg.norm(places[others] - places[best], axis=1)
-    apart = np.linalg.norm(openings_m[others] - openings_m[best], axis=1) > SAME_PLACE_M
-    clear = apart.all() and (margin < costs[others] - costs[best]).all()
-    return best if clear and (not near or (costs[best] < margin).all()) else None
+    best = int(distances.argmin())
+    others = np.arange(len(distances)) != best
+    near = CLEAR_SHARE * np.linalg.norm(places[others] - places[best], axis=1)
+    clear = (distances[best] < near).all() and (near < distances[others] - distances[best]).all()
+    return best if clear and _apart(best, openings_m) else None
+
+
+def _towards(word: Toward, openings_m: FloatArray) -> int | None:
+    """The place that lies in a direction of the image, if it is clearly the one that does."""
+    angles = _angles_rad(word, openings_m)
+    best = int(angles.argmin())
+    clear = (np.delete(angles, best) - angles[best] > CLEAR_ANGLE_RAD).all()
+    if "-" in word and angles[best] > CORNER_ANGLE_RAD:
+        return None
+    return best if clear and _apart(best, openings_m) else None
+
+
+def _angles_rad(word: Toward, openings_m: FloatArray) -> FloatArray:
+    """Angles between a direction of the image and places (K, 3) as seen from the middle of them, shape (K,).
+
+    NaN for what is behind the camera, or at the middle.
+    """
+    seen = CameraIntrinsics(1, 1, 1.0, 1.0, 0.0, 0.0).project(openings_m)
+    off = seen - seen.mean(axis=0)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        return np.asarray(np.arccos(np.clip(off @ _DIRECTIONS[word] / np.linalg.norm(off, axis=1), -1.0, 1.0)))
+
+
+def _apart(index: int, openings_m: FloatArray) -> bool:
+    """Whether a place is none of the others."""
+    others = np.delete(openings_m, index, axis=0)
+    return bool((np.linalg.norm(others - openings_m[index], axis=1) > SAME_PLACE_M).all())
 
 
 def word_of(openings_m: FloatArray, index: int) -> Toward | None:
@@ -201,10 +226,10 @@ def word_of(openings_m: FloatArray, index: int) -> Toward | None:
         openings_m: The places, shape (K, 3), camera frame, metres.
         index: Which of them.
     """
-    seen = _seen(openings_m)
-    off = np.delete(seen[index] - seen, index, axis=0)
-    with np.errstate(invalid="ignore", divide="ignore"):
-        off /= np.linalg.norm(off, axis=1, keepdims=True)
-    best = max(_DIRECTIONS, key=lambda word: float((off @ _DIRECTIONS[word]).min()))
-    told = pointed_at(SlotHint(slot="any", toward=best), openings_m, np.array([0.0, 0.0, 1.0]), None)
-    return best if told == index else None
+
+    def lead_rad(word: Toward) -> float:
+        angles = _angles_rad(word, openings_m)
+        return float((np.delete(angles, index) - angles[index]).min())
+
+    best = max(_DIRECTIONS, key=lead_rad)
+    return best if _towards(best, openings_m) == index else None
