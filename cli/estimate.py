@@ -152,15 +152,21 @@ def estimate(
 
 def _ambiguous(tables: Tables) -> list[str]:
     """One line for all captures whose rack may stand another way round; none without any."""
-    rows = {_capture_of(row): row for row in reversed(tables.racks) if row["ambiguous"]}
+    rows: dict[tuple[str, str, str], Row] = {}
+    for row in tables.racks:
+        if row["ambiguous"]:
+            rows.setdefault(_capture_of(row), row)
     if not rows:
         return []
-    names = list(dict.fromkeys(row["capture"] for row in reversed(rows.values())))
+    first = next(iter(rows.values()))
+    names = list(dict.fromkeys(row["capture"] for row in rows.values()))
     told = f"{', '.join(names[:MOST_NAMED])}{', ...' if len(names) > MOST_NAMED else ''}"
     captures = len({_capture_of(row) for row in tables.racks})
+    each = "; racks that stand differently need a hint each: --hints FILE.csv" if len(rows) > 1 else ""
     return [
         f"{len(rows)} of {captures} captures hold a rack that could as well stand another way round, so that slot "
-        f"names may be swapped: {told}; {_hint_words(next(reversed(rows.values())), tables)}"
+        f"names may be swapped: {told}; for {first['capture']}, {_hint_words(first, tables)}"
+        f"{'' if first['session'] else each}"
     ]
 
 
@@ -176,7 +182,7 @@ def _hint_words(row: Row, tables: Tables) -> str:
         return "give a hint, --hint SLOT@U,V"
     start = "add to its trial 'hint: " if row["session"] else "give --hint "
     end = "'" if row["session"] else ""
-    return f"{start}{hints[0]}{end} if its slots are named right here, else {' or '.join(hints[1:])}"
+    return f"{start}{hints[0]}{end} if its slots are named right, else {' or '.join(hints[1:])}"
 
 
 def _tell(tables: Tables, *, several: bool) -> None:

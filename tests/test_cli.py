@@ -769,7 +769,7 @@ def test_a_rack_that_may_stand_another_way_round_ends_with_1_and_a_hint_that_wor
     )
     assert set(table(tmp_path / "out" / "slots.csv")["ambiguous"].astype(str)) == {"True"}
     given = table(tmp_path / "out" / "racks.csv")
-    said = re.search(r"give --hint (\S+) if its slots are named right here, else (\S+)$", ended.errors[0])
+    said = re.search(r"give --hint (\S+) if its slots are named right, else (\S+); racks that", ended.errors[0])
     assert said is not None
     for example, turned in ((said.group(1), False), (said.group(2), True)):
         ended = tubepose(*run, "--hint", example)

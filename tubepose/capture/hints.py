@@ -33,8 +33,11 @@ Of a rack that stands at 90 deg to the word that leaves 15 deg to either side of
 words, 22.5 deg off at most, still tells the four corners of a square rack apart: 22.5 from 67.5 deg.
 """
 CORNER_ANGLE_RAD = math.radians(60)
-"""Farther from the direction of a corner no place is at it: beyond 45 deg it lies on the other side of the rack's middle
-in one of the two ways that the corner names. The rest is for a rack that stands askew."""
+"""Farther from the direction of a corner no place is at it.
+
+Beyond 45 deg it is on the other side of the rack's middle in one of the two ways that the corner names; the rest is for
+a rack that stands askew.
+"""
 SAME_PLACE_M = 1e-3
 """Places of a slot that are nearer than this are one: the middle slot's, which tells no turns apart.
 
