@@ -216,17 +216,35 @@ def test_a_rack_that_stands_still_is_turned_as_before(soft_scan, turn):
 
 @pytest.mark.parametrize("turned_deg", [0.0, 4.0])
 def test_a_rack_that_was_moved_may_have_been_turned(soft_scan, turned_deg):
+    """Shifted, or turned about one of its corners, which then has not moved."""
     within = CONFIG.rack.left_alone_m
-    T_before = T_CAMERA_SOFT @ make_transform(
-        Rotation.from_euler("z", turned_deg, degrees=True).as_matrix(), np.zeros(3)
-    )
+    corner = np.array([*SOFT.outline_m / 2, SOFT.height_m])
+    R = Rotation.from_euler("z", turned_deg, degrees=True).as_matrix()
+    T_before = T_CAMERA_SOFT @ make_transform(R, corner - R @ corner)
+    moved_mm = 2e3 * np.sin(np.deg2rad(turned_deg / 2)) * np.hypot(*SOFT.outline_m)
     if not turned_deg:
         T_before[1, 3] += 1.2 * within
-    moved_mm = 6.0 if not turned_deg else 2e3 * np.sin(np.deg2rad(turned_deg / 2)) * np.hypot(*SOFT.outline_m) / 2
+        moved_mm = 1.2e3 * within
     pose = register_rack(soft_scan, SOFT, CONFIG, EarlierRack(T_before, within))
     assert (pose.ambiguous, pose.resolved_by) == (True, "rule")
     said = re.match(r"the rack has moved by (\d+\.\d) mm or more .*, at most 5 mm expected", pose.hint_note)
     assert float(said.group(1)) == pytest.approx(moved_mm, abs=0.3)
+
+
+def test_what_fits_every_turn_decides_nothing():
+    """The middle slot, and a rack that may have moved by as much as a turn moves it."""
+    T_true = scenes.camera_from_rack(SQUARE, np.deg2rad(35))
+    scan = transform_points(T_true, scenes.rack_top(SQUARE))
+    for hint, note in (
+        (
+            SlotHint(slot="C3", toward="left"),
+            "C3 is at nearly the same place however the rack is turned: name a slot at",
+        ),
+        (EarlierRack(T_true, 1.0), "a turn of this rack moves it by less than 1000 mm: give a hint for this capture"),
+    ):
+        pose = register_rack(scan, SQUARE, CONFIG, hint)
+        assert (pose.ambiguous, pose.resolved_by) == (True, "rule")
+        assert pose.hint_note.startswith(note)
 
 
 @pytest.mark.parametrize("turn", range(4))
