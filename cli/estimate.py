@@ -15,6 +15,9 @@ if TYPE_CHECKING:
     from tubepose.batch import Job, Tables, UnnamedJob
     from tubepose.records import Row
 
+MOST_NAMED = 5
+"""Captures that one line names."""
+
 
 def estimate(
     captures: Annotated[
@@ -65,8 +68,19 @@ def estimate(
     image_topic: Annotated[str | None, typer.Option(help="Topic of the images in an .mcap file.")] = None,
     info_topic: Annotated[str | None, typer.Option(help="Topic of the CameraInfo in an .mcap file.")] = None,
     hint: Annotated[
-        str | None, typer.Option(help="Which way round the rack stands: SLOT@U,V, a slot and its pixel.")
+        list[str] | None,
+        typer.Option(
+            help="Which way round the racks stand: SLOT@U,V (pixel), SLOT@top-left and the like, SLOT@X,Y,Z (metres, "
+            "camera frame), or previous: as in the capture before. Twice: first a slot's place, then previous."
+        ),
     ] = None,
+    hints: Annotated[
+        Path | None, typer.Option(help="CSV file with the columns capture, hint; goes before --hint.")
+    ] = None,
+    require_unambiguous: Annotated[
+        bool,
+        typer.Option("--require-unambiguous", help="Exit 1 where a rack may stand another way round (after writing)."),
+    ] = False,
     seeds: Annotated[int, typer.Option(min=1, help="Seeds of a stochastic method: 0 to N-1.")] = 1,
     config: Annotated[Path | None, typer.Option(help="YAML file that changes defaults (docs/method.md).")] = None,
     overlays: Annotated[bool, typer.Option(help="Write one overlay picture per frame.")] = True,
@@ -79,6 +93,7 @@ def estimate(
     from tubepose.capture.session import SESSION_FILE, is_session
     from tubepose.config import load_config
     from tubepose.errors import CaptureError, kept
+    from tubepose_cli.hints import read_hints, refuse_unknown_captures
     from tubepose_cli.inputs import (
         capture_jobs,
         make_detector,
@@ -99,6 +114,7 @@ def estimate(
     tube_models = read_tubes(tubes) if tubes is not None else ()
     if not any(path.exists() for path in captures):  # before seconds of imports
         finish([no_such_file(path) for path in captures])
+    told = read_hints(hint or (), hints, choice.rack)
     methods = read_methods(method)
     detector_for = make_detector(detector, model, boxes, classes, layout, settings)
     topics = {"cloud": cloud_topic, "depth": depth_topic, "image": image_topic, "info": info_topic}
@@ -108,7 +124,7 @@ def estimate(
     for path in captures:
         with kept(None if fail_fast else problems):
             found, unread = capture_jobs(
-                path, choice, tube_models, settings, unit=unit, hint=hint, topics=topics, fail_fast=fail_fast
+                path, choice, tube_models, settings, unit=unit, hints=told, topics=topics, fail_fast=fail_fast
             )
             distinct, twins = refuse_twins(found, jobs)
             if twins and fail_fast:
@@ -118,10 +134,12 @@ def estimate(
     if not jobs:
         finish(problems)  # before anything of an earlier run is written over
     refuse_idle_topics(jobs, topics)
+    with kept(problems if problems and not fail_fast else None):
+        refuse_unknown_captures(jobs, told)
     tables = run_estimates(
         jobs, methods, detector_for, settings, out, sys.argv, seeds=seeds, overlays=overlays, fail_fast=fail_fast,
         inputs=[
-            *(path for path in (used_model(detector, model), boxes, classes, config) if path is not None),
+            *(path for path in (used_model(detector, model), boxes, classes, hints, config) if path is not None),
             *(path for path in captures if path.exists() and (path.name == SESSION_FILE or is_session(path))),
         ],
         problems=problems, detector=detector,
@@ -129,7 +147,42 @@ def estimate(
     _tell(tables, several=len(methods) > 1)
     if tubes is None and any(not job.tubes for job in jobs):
         say("no --tubes given: only the rack and its slots are estimated")
-    finish([*problems, *tables.problems])
+    finish([*problems, *tables.problems, *(_ambiguous(tables) if require_unambiguous else [])])
+
+
+def _ambiguous(tables: Tables) -> list[str]:
+    """One line for all captures whose rack may stand another way round; none without any."""
+    rows: dict[tuple[str, str, str], Row] = {}
+    for row in tables.racks:
+        if row["ambiguous"]:
+            rows.setdefault(_capture_of(row), row)
+    if not rows:
+        return []
+    first = next(iter(rows.values()))
+    names = list(dict.fromkeys(row["capture"] for row in rows.values()))
+    told = f"{', '.join(names[:MOST_NAMED])}{', ...' if len(names) > MOST_NAMED else ''}"
+    captures = len({_capture_of(row) for row in tables.racks})
+    each = "; racks that stand differently need a hint each: --hints FILE.csv" if len(rows) > 1 else ""
+    return [
+        f"{len(rows)} of {captures} captures hold a rack that could as well stand another way round, so that slot "
+        f"names may be swapped: {told}; for {first['capture']}, {_hint_words(first, tables)}"
+        f"{'' if first['session'] else each}"
+    ]
+
+
+def _hint_words(row: Row, tables: Tables) -> str:
+    """What to do about an ambiguous rack: a hint that works, and what it says."""
+    from tubepose.labware import RackModel
+    from tubepose.rack.turns import example_hints
+    from tubepose.records import transform_of
+
+    rack = tables.labware[row["rack"]]
+    hints = example_hints(transform_of(row), rack) if isinstance(rack, RackModel) else ()
+    if not hints:
+        return "give a hint, --hint SLOT@U,V"
+    start = "add to its trial 'hint: " if row["session"] else "give --hint "
+    end = "'" if row["session"] else ""
+    return f"{start}{hints[0]}{end} if its slots are named right, else {' or '.join(hints[1:])}"
 
 
 def _tell(tables: Tables, *, several: bool) -> None:
@@ -145,16 +198,18 @@ def _tell(tables: Tables, *, several: bool) -> None:
         if row["rack"]:
             by = f"{row['method']}: " if several else ""
             found = describe_tubes(tubes.get(_answer_of(row), []))
-            say(f"{row['capture']} frame {row['frame']}: rack {row['rack']} {_rack_words(row)}; {by}{found}")
+            say(f"{row['capture']} frame {row['frame']}: rack {row['rack']} {_rack_words(row, tables)}; {by}{found}")
         elif _capture_of(row) in with_rack:  # else its reason is among the problems
             say(f"{row['capture']} frame {row['frame']}: {row['status']}: {row['reason']}")
 
 
-def _rack_words(row: Row) -> str:
+def _rack_words(row: Row, tables: Tables) -> str:
     """How a rack was found, and what is left open."""
     if row["status"] == "ok":
-        settle = row["hint_note"] or "--hint SLOT@U,V settles it"
-        turn = f", may stand another way round (slot names may be swapped; {settle})" if row["ambiguous"] else ""
+        turn = ""
+        if row["ambiguous"]:
+            settle = row["hint_note"] or _hint_words(row, tables)
+            turn = f", may stand another way round (slot names may be swapped; {settle})"
         margin = row["named_by_margin"]
         named = f" (named by a margin of {margin:.0%})" if not math.isnan(margin) else ""
         words = f"ok{named}, inlier rmse {row['inlier_rmse_m'] * 1e3:.2f} mm{turn}"

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import difflib
-import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -11,9 +10,9 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from tubepose.batch import DetectorFactory, Job, UnnamedJob
-    from tubepose.capture.session import SlotHint
     from tubepose.config import Config
-    from tubepose.labware import RackModel, TubeModel
+    from tubepose.labware import TubeModel
+    from tubepose_cli.hints import HintChoice
     from tubepose_cli.racks import RackChoice
 
 SAMPLE = "sample"
@@ -107,7 +106,7 @@ def capture_jobs(
     config: Config,
     *,
     unit: str | None = None,
-    hint: str | None = None,
+    hints: HintChoice | None = None,
     topics: Mapping[str, str | None] | None = None,
     fail_fast: bool = False,
 ) -> tuple[list[Job | UnnamedJob], list[str]]:
@@ -122,8 +121,8 @@ def capture_jobs(
     from tubepose_cli.racks import rack_finder
 
     if path.name == SESSION_FILE or (path.is_dir() and is_session(path)):
-        given = {"--unit": unit, "--hint": hint} | {f"--{kind}-topic": name for kind, name in (topics or {}).items()}
-        idle = [option for option, value in given.items() if value is not None]
+        given = {"--unit": unit} | {f"--{kind}-topic": name for kind, name in (topics or {}).items()}
+        idle = [option for option, value in given.items() if value is not None] + (hints.options if hints else [])
         if idle:
             raise ConfigError(
                 f"{path}: {', '.join(idle)} given, but a session says that itself: unit, topics, and a trial's hint; "
@@ -133,40 +132,27 @@ def capture_jobs(
         if choice.open:
             find = rack_finder(choice, config)
             return [
-                UnnamedJob(job.capture, find, tubes or job.tubes, job.hint, job.session, job.trial) for job in known
+                UnnamedJob(
+                    job.capture, find, tubes or job.tubes, job.hint, job.session, job.trial, previous=job.previous
+                )
+                for job in known
             ], problems
         return [replace(job, rack=choice.rack or job.rack, tubes=tubes or job.tubes) for job in known], problems
     if not path.exists():
         raise CaptureError(no_such_file(path))
     topic = {f"{kind}_topic": name for kind, name in (topics or {}).items()}
     opened = open_captures(path, unit=unit, **topic)
-    told = read_hint(hint, choice.rack) if hint is not None else None
+    told = [(capture, *(hints.of(capture.name) if hints else (None, False))) for capture in opened]
     if choice.rack is not None:
-        return [Job(capture, choice.rack, tubes, told) for capture in opened], []
+        rack = choice.rack
+        return [Job(capture, rack, tubes, place, previous=previous) for capture, place, previous in told], []
     if not choice.open:
         raise ConfigError(
             f"{path}: not a session, so the rack must be named: --rack NAME|FILE|auto|grid "
             "(see 'tubepose labware list')"
         )
     find = rack_finder(choice, config)
-    return [UnnamedJob(capture, find, tubes, told) for capture in opened], []
-
-
-def read_hint(text: str, rack: RackModel | None) -> SlotHint:
-    """The hint SLOT@U,V; whether a rack that is still to be named has the slot, the batch tells."""
-    from tubepose.capture.session import SlotHint
-    from tubepose.errors import ConfigError
-
-    slot, _, pixel = text.partition("@")
-    try:
-        u, v = (float(value) for value in pixel.split(","))
-        if not math.isfinite(u + v):
-            raise ValueError(pixel)
-    except ValueError:
-        raise ConfigError(f"--hint {text}: expected SLOT@U,V, for example A1@412,300") from None
-    if rack is not None and not rack.has_slot(slot):
-        raise ConfigError(f"--hint {text}: no slot {slot} in rack {rack.name}; {rack.slot_words}")
-    return SlotHint(slot=slot, pixel=(u, v))
+    return [UnnamedJob(capture, find, tubes, place, previous=previous) for capture, place, previous in told], []
 
 
 def refuse_twins(

@@ -13,7 +13,8 @@ import scenes
 from tubepose import batch
 from tubepose.batch import MOST_ASKED, Job, Tables, UnnamedJob, run_jobs, session_jobs, trial_capture
 from tubepose.capture.frame import RgbdFrame
-from tubepose.capture.session import Session, SlotHint, load_session
+from tubepose.capture.hints import SlotHint
+from tubepose.capture.session import Session, load_session
 from tubepose.config import Config
 from tubepose.detection import Detection
 from tubepose.detection.geometric import GeometricDetector
@@ -21,7 +22,7 @@ from tubepose.errors import CaptureError, DetectorError
 from tubepose.labware import load_rack, load_tube
 from tubepose.rack import RackPose, RackStatus
 from tubepose.records import ESTIMATE_COLUMNS, RACK_COLUMNS, SENSOR_COLUMNS, SLOT_COLUMNS, TIMING_COLUMNS, to_table
-from tubepose.transforms import transform_points
+from tubepose.transforms import HALF_TURN, transform_points
 
 CONFIG = Config()
 RACK = load_rack("round-10ml-3x4")
@@ -233,6 +234,7 @@ def session(tmp_path: Path) -> Session:
         "- {name: one, tubes: {A1: blood-16x100, B1: blood-16x100}, original: scan-1}\n"
         "- {name: two, tubes: {A1: centrifuge-10ml, C3: blood-16x100}, original: scan-2,"
         " hint: {slot: A1, pixel: [5, 6]}}\n"
+        "- {name: four, tubes: {}, original: scan-2, hint: 'A1@top-left,previous'}\n"
         "- {name: three, tubes: {}, original: folder}\n"
     )
     for name in ("scan-2", "folder/a", "folder/b"):
@@ -243,7 +245,10 @@ def session(tmp_path: Path) -> Session:
 
 def test_a_session_gives_one_job_per_trial_and_one_line_per_trial_that_has_none(session: Session) -> None:
     jobs, problems = session_jobs(session)
-    assert [(job.session, job.trial, job.capture.name) for job in jobs] == [("s", "two", "scan-2")]
+    names = [(job.session, job.trial, job.capture.name) for job in jobs]
+    assert names == [("s", "two", "scan-2"), ("s", "four", "scan-2")]
+    assert [job.previous for job in jobs] == [False, True]
+    assert jobs[1].hint == SlotHint(slot="A1", toward="top-left")
     assert [tube.name for tube in jobs[0].tubes] == ["blood-16x100", "centrifuge-10ml"]
     assert jobs[0].hint is not None
     assert jobs[0].hint.pixel == (5, 6)
@@ -258,7 +263,7 @@ def test_fail_fast_raises_at_the_first_trial_without_its_capture(session: Sessio
 
 
 def test_captures_of_one_name_are_told_apart_by_their_paths(session: Session) -> None:
-    first, second, _ = session.trials
+    first, second, *_ = session.trials
     trials = (first.model_copy(update={"original": "folder/a"}), second.model_copy(update={"printed": "scan-2/a"}))
     twins = session.model_copy(update={"trials": trials})
     assert trial_capture(twins, trials[0], "folder/a").name == "folder/a"
@@ -324,6 +329,81 @@ def test_a_hint_of_another_rack_is_told_in_one_line() -> None:
     tables = run(unnamed("good", GOOD, nameable=(0,), hint=hint), job("good", GOOD, hint=hint))
     line = f"captures/scan: the hint speaks of slot F9, and rack {RACK.name} has none of that name; its slots run"
     assert [problem.startswith(line) for problem in tables.problems] == [True, True]
+
+
+# Which way round it stands ------------------------------------------------------------------------------------------
+
+OPENING = transform_points(T_CAMERA_RACK, np.array([*RACK.slot("A1").center_m, RACK.height_m]))
+A1 = SlotHint(slot="A1", point_m=(OPENING[0], OPENING[1], OPENING[2]))
+OTHER_WAY = transform_points(T_CAMERA_RACK @ HALF_TURN, np.array([*RACK.slot("A1").center_m, RACK.height_m]))
+TURNED_A1 = SlotHint(slot="A1", point_m=(OTHER_WAY[0], OTHER_WAY[1], OTHER_WAY[2]))
+
+
+def moved(frame: RgbdFrame, shift_m: float, **more: Any) -> RgbdFrame:
+    return replace(frame, cloud_m=frame.cloud_m + np.array([shift_m, 0.0, 0.0]), **more)
+
+
+def resolved(tables: Tables) -> list[str]:
+    return [row["resolved_by"] for row in tables.racks]
+
+
+@pytest.mark.parametrize("place", [A1, TURNED_A1], ids=["as-it-is", "half-turn"])
+def test_captures_after_the_first_stand_as_it_did(place: SlotHint) -> None:
+    """In one direction or the other the rule would have taken the other turn."""
+    jobs = [job(name, moved(GOOD, shift_m), hint=place, previous=True) for name, shift_m in (("a", 0), ("b", 2e-3))]
+    tables = run(*jobs)
+    assert resolved(tables) == ["hint", "previous"]
+    assert not any(row["ambiguous"] for rows in (tables.racks, tables.slots, tables.estimates) for row in rows)
+    filled = [row["slot"] for row in tables.slots if row["occupied"]]
+    assert filled == (["B2"] if place is A1 else ["B3"]) * 2
+
+
+def test_a_rack_may_creep_but_not_jump() -> None:
+    """What counts is the last frame that knew: each of four steps of 2 mm is of a rack that was left alone."""
+    steps = [moved(GOOD, 2e-3 * k, index=k) for k in range(5)]
+    tables = run(job("good", *steps, moved(GOOD, 30e-3, index=5), moved(GOOD, 9e-3, index=6), hint=A1, previous=True))
+    assert resolved(tables) == ["hint", *["previous"] * 4, "rule", "previous"]
+    jumped = tables.racks[5]
+    assert jumped["ambiguous"]
+    assert jumped["hint_note"].startswith("the rack has moved by 22.")
+    assert {row["ambiguous"] for row in tables.slots if row["frame"] == 5} == {True}
+    assert {row["ambiguous"] for row in tables.estimates if row["frame"] == 5} == {True}
+
+
+def test_without_an_earlier_turn_there_is_nothing_to_go_by() -> None:
+    tables = run(job("a", GOOD, previous=True), job("b", GOOD, hint=A1), job("c", GOOD, previous=True))
+    assert resolved(tables) == ["rule", "hint", "previous"]
+    told = "the turn of the rack was known in no earlier frame: give a hint for this capture"
+    assert [row["hint_note"] for row in tables.racks] == [told, "", ""]
+
+
+def test_a_hint_of_a_capture_of_its_own_goes_before_an_earlier_frame() -> None:
+    """Said once for all captures a place is the first one's; said again it is of a rack that was set up anew."""
+    again = A1.model_copy()
+    jobs = [job("a", GOOD, hint=A1, previous=True), job("b", moved(GOOD, 20e-3), hint=A1, previous=True)]
+    assert resolved(run(*jobs)) == ["hint", "rule"]
+    jobs[1] = job("b", moved(GOOD, 20e-3), moved(GOOD, 20e-3, index=1), hint=again, previous=True)
+    assert resolved(run(*jobs)) == ["hint", "hint", "previous"]
+
+
+def test_another_session_or_rack_is_no_earlier_frame() -> None:
+    tables = run(job("a", GOOD, hint=A1, session="s"), job("b", GOOD, previous=True, session="t"))
+    assert resolved(tables) == ["hint", "rule"]
+    other = RACK.model_copy(update={"name": "other"})
+    tables = run(job("a", GOOD, hint=A1), replace(job("b", GOOD, previous=True), rack=other))
+    assert resolved(tables) == ["hint", "rule"]
+    assert tables.racks[1]["hint_note"].startswith(f"the last rack whose turn was known was another one, {RACK.name}")
+
+
+def test_a_rack_that_is_named_on_the_way_stands_as_before_too() -> None:
+    frames = [replace(GOOD, index=index) for index in range(3)]
+    tables = run(unnamed("good", *frames, nameable=(0,), hint=A1, previous=True))
+    assert resolved(tables) == ["hint", "previous", "previous"]
+
+
+def test_the_warm_up_is_no_earlier_frame() -> None:
+    tables = run(job("a", GOOD, previous=True), warm_up=True)
+    assert resolved(tables) == ["rule"]
 
 
 def test_a_stamp_is_exact_beside_a_capture_without_one() -> None:

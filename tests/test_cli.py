@@ -490,6 +490,10 @@ def test_gt_keeps_its_problems_in_the_record(small_session: Path, tmp_path: Path
         (("--tubes", "blood-16x10"), "unknown tube 'blood-16x10'; did you mean 'blood-16x100'?; known: "),
         (("--unit", "cm"), "unit 'cm' is not known; expected m or mm"),
         (("--hint", "Z9@1,1"), "no slot Z9 in rack round-10ml-3x4; its slots run from A1 to C4"),
+        (("--hint", "Z9@top"), "--hint Z9@top: no slot Z9 in rack round-10ml-3x4"),
+        (("--hint", "A1@100,-50,620"), "--hint A1@100,-50,620: the point is 630 m away; expected metres"),
+        (("--hint", "A1@top", "--hint", "B1@top"), "--hint A1@top,B1@top: expected SLOT@U,V"),
+        (("--hints", "none.csv"), "none.csv: cannot be read"),
         (("--config", "none.yaml"), "none.yaml: no such file"),
         (("--config", "wrong.yaml"), "wrong.yaml: unknown key 'rak'; known keys: preprocess, rack_top, rack"),
     ],
@@ -778,6 +782,87 @@ def test_what_became_of_the_tubes_is_said_with_the_commonest_reason() -> None:
     assert describe_tubes([]) == "0 tubes ok"
 
 
+# Which way round it stands
+
+CLOUD_ALONE = ("--rack", SMALL_RACK, "--detector", "geometric", "--method", "upright", "--no-overlays")
+
+
+@pytest.fixture(scope="module")
+def twice(small_session: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with two captures of a rack that was left alone."""
+    folder = tmp_path_factory.mktemp("twice")
+    for name in ("one", "two"):
+        shutil.copytree(original(small_session), folder / name)
+    return folder
+
+
+def test_a_rack_that_may_stand_another_way_round_ends_with_1_and_a_hint_that_works(twice: Path, tmp_path: Path) -> None:
+    run = ("estimate", twice, *CLOUD_ALONE, "--require-unambiguous", "--out", tmp_path / "out")
+    ended = tubepose(*run)
+    one_error(
+        ended, "2 of 2 captures hold a rack that could as well stand another way round", "may be swapped: one, two;"
+    )
+    assert set(table(tmp_path / "out" / "slots.csv")["ambiguous"].astype(str)) == {"True"}
+    given = table(tmp_path / "out" / "racks.csv")
+    said = re.search(r"give --hint (\S+) if its slots are named right, else (\S+); racks that", ended.errors[0])
+    assert said is not None
+    for example, turned in ((said.group(1), False), (said.group(2), True)):
+        ended = tubepose(*run, "--hint", example)
+        assert (ended.code, ended.errors) == (0, [])
+        racks = table(tmp_path / "out" / "racks.csv")
+        assert set(racks["resolved_by"]) == {"hint"}
+        assert set(table(tmp_path / "out" / "slots.csv")["ambiguous"].astype(str)) == {"False"}
+        same = np.allclose(racks[list(POSE_COLUMNS[3:])].to_numpy(float), given[list(POSE_COLUMNS[3:])].to_numpy(float))
+        assert same is not turned
+
+
+def test_without_the_option_an_ambiguous_rack_is_said_and_no_error(twice: Path, tmp_path: Path) -> None:
+    ended = tubepose("estimate", twice, *CLOUD_ALONE, "--out", tmp_path / "out")
+    assert (ended.code, ended.errors) == (0, [])
+    assert "may stand another way round (slot names may be swapped; give --hint A1@" in ended.err
+
+
+@pytest.mark.parametrize("options", [("--hint", "A1@top", "--hint", "previous"), ("--hint", "previous,A1@top")])
+def test_one_hint_and_previous_serve_a_folder(options: tuple[str, ...], twice: Path, tmp_path: Path) -> None:
+    ended = tubepose("estimate", twice, *CLOUD_ALONE, "--require-unambiguous", *options, "--out", tmp_path / "out")
+    assert (ended.code, ended.errors) == (0, [])
+    assert list(table(tmp_path / "out" / "racks.csv")["resolved_by"]) == ["hint", "previous"]
+
+
+@pytest.mark.parametrize("text", ["capture,hint\none,A1@top\n", "\ufeffhint;capture\n A1@top;one\n\n"])
+def test_a_file_gives_captures_hints_of_their_own(text: str, twice: Path, tmp_path: Path) -> None:
+    (tmp_path / "hints.csv").write_text(text, encoding="utf-8")
+    run = ("estimate", twice, *CLOUD_ALONE, "--hints", tmp_path / "hints.csv", "--out", tmp_path / "out")
+    assert tubepose(*run).code == 0
+    assert list(table(tmp_path / "out" / "racks.csv")["resolved_by"]) == ["hint", "rule"]
+    assert tubepose(*run, "--hint", "previous").code == 0
+    assert list(table(tmp_path / "out" / "racks.csv")["resolved_by"]) == ["hint", "previous"]
+    record = json.loads((tmp_path / "out" / "run.json").read_text())
+    assert str(tmp_path / "hints.csv") in record["inputs_sha256"]
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("", "expected a first line 'capture,hint', found ''"),
+        ("scan,where\none,A1@top\n", "expected a first line 'capture,hint', found 'scan,where'"),
+        (
+            "capture,hint\none,A1@4,5\n",
+            ', line 2: more than two columns; put a hint with commas into quotes: "A1@412,300"',
+        ),
+        ("capture,hint\none,A1@up\n", ", line 2: hint A1@up: expected SLOT@U,V"),
+        ("capture,hint\none,Z9@top\n", ", line 2: hint Z9@top: no slot Z9 in rack round-10ml-3x4"),
+        ("capture,hint\none,\n", ", line 2: capture one has no hint; leave the line out"),
+        ("capture,hint\none,A1@top\none,A1@top\n", ", line 3: capture one is there twice"),
+        ("capture,hint\nthree,A1@top\n", "no capture is named three; the captures are one, two"),
+    ],
+)
+def test_a_file_of_hints_that_cannot_be_used_is_one_line(text: str, words: str, twice: Path, tmp_path: Path) -> None:
+    (tmp_path / "hints.csv").write_text(text)
+    run = ("estimate", twice, *CLOUD_ALONE, "--hints", tmp_path / "hints.csv", "--out", tmp_path / "out")
+    one_error(tubepose(*run), f"{tmp_path / 'hints.csv'}", words)
+
+
 def test_without_tubes_it_is_said_that_only_the_rack_is_estimated(small_session: Path, tmp_path: Path) -> None:
     ended = tubepose("estimate", original(small_session), "--rack", SMALL_RACK, "--out", tmp_path / "out")
     assert ended.code == 0
@@ -788,6 +873,7 @@ def test_without_tubes_it_is_said_that_only_the_rack_is_estimated(small_session:
     ("options", "words"),
     [
         (("--hint", "A1@10,10"), "--hint given, but a session says that itself"),
+        (("--hint", "previous"), "--hint given, but a session says that itself"),
         (("--unit", "mm", "--depth-topic", "/d"), "--unit, --depth-topic given, but a session says that itself"),
     ],
 )

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 import tubepose.ground_truth
 from tubepose.capture.frame import CameraIntrinsics, RgbdFrame
-from tubepose.capture.session import SlotHint
+from tubepose.capture.hints import SlotHint
 from tubepose.ground_truth import GroundTruthConfig, GroundTruthResult, measure_ground_truth
 from tubepose.labware import CapModel, RackModel, TubeModel
 from tubepose.transforms import axis_rotation, invert_transform, make_transform, tilt_rad, transform_points, translation
@@ -334,6 +334,17 @@ def test_hint_resolves_a_symmetric_layout(yaw_deg: float, known: bool) -> None:
     result = scene.measure(frame, hint=SlotHint(slot="A1", pixel=(float(u) + 3, float(v) - 2)))
     assert result.status == "ok"
     np.testing.assert_allclose(invert_transform(scene.T_camera_rack) @ result.T_camera_rack, np.eye(4), atol=3e-4)
+
+
+@pytest.mark.parametrize("yaw_deg", [20.0, 200.0])
+def test_hints_without_pixels_resolve_a_symmetric_layout(yaw_deg: float) -> None:
+    scene = Scene(layout=SYMMETRIC, yaw_deg=yaw_deg)
+    place = transform_points(scene.T_camera_rack, np.array([*RACK.slot("A1").center_m, RACK.height_m]))
+    point = SlotHint(slot="A1", point_m=(place[0], place[1], place[2] - 0.02))
+    for hint in (point, SlotHint(slot="A1", toward="left" if place[0] < 0 else "right")):
+        result = scene.measure(hint=hint)
+        assert result.status == "ok"
+        np.testing.assert_allclose(invert_transform(scene.T_camera_rack) @ result.T_camera_rack, np.eye(4), atol=3e-4)
 
 
 def test_hint_that_contradicts_the_caps_refuses_the_frame() -> None:

@@ -9,7 +9,7 @@ import profile_scenes as ps
 import pytest
 import scenes
 
-from tubepose.capture.session import SlotHint
+from tubepose.capture.hints import SlotHint
 from tubepose.config import Config
 from tubepose.detection import Detection
 from tubepose.detection.geometric import GeometricDetector

@@ -8,11 +8,12 @@ import pytest
 import scenes
 from scipy.spatial.transform import Rotation
 
-from tubepose.capture.session import SlotHint
+from tubepose.capture.hints import EarlierRack, SlotHint, read_hint
 from tubepose.checks import failed
 from tubepose.config import Config, RackConfig
 from tubepose.labware import RackModel, load_rack, load_tube
 from tubepose.rack import RackStatus, register_rack
+from tubepose.rack.turns import example_hints
 from tubepose.transforms import HALF_TURN, QUARTER_TURN, invert_transform, make_transform, transform_points
 
 CONFIG = Config()
@@ -144,6 +145,118 @@ def test_a_hint_without_intrinsics_is_not_used(soft_scan):
     assert (pose.ambiguous, pose.resolved_by) == (True, "rule")
     assert pose.hint_note.startswith("the hint for A1 is a pixel, and this cloud has none")
     assert register_rack(soft_scan, SOFT, CONFIG, None, None).hint_note == ""
+
+
+@pytest.mark.parametrize("turn", [np.eye(4), HALF_TURN], ids=["as-it-is", "half-turn"])
+@pytest.mark.parametrize("method", ["edges", "obb-icp"])
+def test_hints_without_pixels_decide_for_either_turn(soft_scan, turn, method):
+    config = CONFIG.model_copy(update={"rack": RackConfig(method=method)})
+    T_true = T_CAMERA_SOFT @ turn
+    place = transform_points(T_true, np.array([*SOFT.slot("B2").center_m, SOFT.height_m + 0.05]))
+    near = transform_points(T_true, np.array([*SOFT.slot("A1").center_m, SOFT.height_m]))
+    told = example_hints(T_true, SOFT)[0]
+    hints = {
+        "point": SlotHint(slot="B2", point_m=tuple(place + 0.01)),
+        "side": SlotHint(slot="A1", toward="left" if near[0] < 0 else "right"),
+        "example": read_hint(told).place,
+    }
+    for hint in hints.values():
+        pose = register_rack(soft_scan, SOFT, config, hint)
+        assert (pose.ambiguous, pose.resolved_by, pose.hint_note) == (False, "hint", "")
+        assert_same_pose(pose.T_camera_rack, T_true, 0.3, 1e-3)
+
+
+def test_the_examples_name_every_turn_the_one_given_first():
+    T_camera_square = scenes.camera_from_rack(SQUARE, np.deg2rad(10))
+    assert example_hints(T_camera_square, SQUARE) == (
+        "A1@top-left",
+        "A1@bottom-left",
+        "A1@bottom-right",
+        "A1@top-right",
+    )
+    lone = {"grid": {"rows": 1, "columns": 1, "pitch_mm": [18, 18], "slot": {"shape": "round", "size_mm": [15, 15]}}}
+    single = RackModel.model_validate(SQUARE.model_dump(exclude_defaults=True) | {"kind": "rack"} | lone)
+    assert example_hints(T_camera_square, single) == ()
+
+
+@pytest.mark.parametrize(
+    ("hint", "words"),
+    [
+        (
+            SlotHint(slot="A1", toward="top"),
+            "A1 is seen at the top, which does not tell its places apart: it is at the left in the pose given or, the "
+            "rack turned, at the right",
+        ),
+        (SlotHint(slot="A1", point_m=(0.5, 0.2, 0.6)), "A1 is seen at 0.500,0.200,0.600, but it is at "),
+        (EarlierRack(None, 5e-3, "no earlier frame"), "no earlier frame: give a hint for this capture"),
+    ],
+)
+def test_the_note_of_a_hint_without_pixels_says_why_it_decides_nothing(hint, words):
+    row = RackModel.model_validate(
+        {
+            "kind": "rack", "name": "row", "outline_mm": [180, 50], "height_mm": 60, "floor_mm": 4,
+            "grid": {"rows": 2, "columns": 8, "pitch_mm": [20, 20], "slot": {"shape": "round", "size_mm": [15, 15]}},
+        }
+    )  # fmt: skip
+    T_true = scenes.camera_from_rack(row)
+    pose = register_rack(transform_points(T_true, scenes.rack_top(row)), row, CONFIG, hint)
+    assert (pose.ambiguous, pose.resolved_by) == (True, "rule")
+    assert words in pose.hint_note
+
+
+@pytest.mark.parametrize("turn", [np.eye(4), HALF_TURN], ids=["as-it-is", "half-turn"])
+def test_a_rack_that_stands_still_is_turned_as_before(soft_scan, turn):
+    within = CONFIG.rack.left_alone_m
+    for shift_m in (0.0, 0.9 * within):
+        T_before = T_CAMERA_SOFT @ turn
+        T_before[0, 3] += shift_m
+        pose = register_rack(soft_scan, SOFT, CONFIG, EarlierRack(T_before, within))
+        assert (pose.ambiguous, pose.resolved_by, pose.hint_note) == (False, "previous", "")
+        assert_same_pose(pose.T_camera_rack, T_CAMERA_SOFT @ turn)
+
+
+@pytest.mark.parametrize("turned_deg", [0.0, 4.0])
+def test_a_rack_that_was_moved_may_have_been_turned(soft_scan, turned_deg):
+    """Shifted, or turned about one of its corners, which then has not moved."""
+    within = CONFIG.rack.left_alone_m
+    corner = np.array([*SOFT.outline_m / 2, SOFT.height_m])
+    R = Rotation.from_euler("z", turned_deg, degrees=True).as_matrix()
+    T_before = T_CAMERA_SOFT @ make_transform(R, corner - R @ corner)
+    moved_mm = 2e3 * np.sin(np.deg2rad(turned_deg / 2)) * np.hypot(*SOFT.outline_m)
+    if not turned_deg:
+        T_before[1, 3] += 1.2 * within
+        moved_mm = 1.2e3 * within
+    pose = register_rack(soft_scan, SOFT, CONFIG, EarlierRack(T_before, within))
+    assert (pose.ambiguous, pose.resolved_by) == (True, "rule")
+    said = re.match(r"the rack has moved by (\d+\.\d) mm or more .*, at most 5 mm expected", pose.hint_note)
+    assert float(said.group(1)) == pytest.approx(moved_mm, abs=0.3)
+
+
+def test_what_fits_every_turn_decides_nothing():
+    """The middle slot, and a rack that may have moved by as much as a turn moves it."""
+    T_true = scenes.camera_from_rack(SQUARE, np.deg2rad(35))
+    scan = transform_points(T_true, scenes.rack_top(SQUARE))
+    for hint, note in (
+        (
+            SlotHint(slot="C3", toward="left"),
+            "C3 is at nearly the same place however the rack is turned: name a slot at",
+        ),
+        (EarlierRack(T_true, 1.0), "a turn of this rack moves it by less than 1000 mm: give a hint for this capture"),
+    ):
+        pose = register_rack(scan, SQUARE, CONFIG, hint)
+        assert (pose.ambiguous, pose.resolved_by) == (True, "rule")
+        assert pose.hint_note.startswith(note)
+
+
+@pytest.mark.parametrize("turn", range(4))
+def test_all_four_turns_of_a_square_rack_are_told_by_words_and_by_an_earlier_frame(turn):
+    T_true = scenes.camera_from_rack(SQUARE, np.deg2rad(35)) @ np.linalg.matrix_power(QUARTER_TURN, turn)
+    scan = transform_points(T_true, scenes.rack_top(SQUARE))
+    told = read_hint(example_hints(T_true, SQUARE)[0]).place
+    for hint, by in ((told, "hint"), (EarlierRack(T_true, CONFIG.rack.left_alone_m), "previous")):
+        pose = register_rack(scan, SQUARE, CONFIG, hint)
+        assert (pose.ambiguous, pose.resolved_by) == (False, by)
+        assert_same_pose(pose.T_camera_rack, T_true)
 
 
 @pytest.mark.parametrize("yaw_deg", [10, 100, 190, 280])

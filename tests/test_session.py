@@ -6,6 +6,7 @@ from typing import Any
 import pytest
 import yaml
 
+from tubepose.capture.hints import SlotHint
 from tubepose.capture.session import is_session, load_session
 from tubepose.errors import CaptureError, LabwareError
 from tubepose.labware import load_tube
@@ -53,6 +54,22 @@ def test_session_is_read_with_its_labware(tmp_path):
     assert (second.printed, second.hint, session.tubes_of(second)) == (None, None, ())
 
 
+@pytest.mark.parametrize(
+    ("given", "hint", "previous"),
+    [
+        ("A1@412,300", SlotHint(slot="A1", pixel=(412, 300)), False),
+        ("A1@0.1,-0.05,0.62", SlotHint(slot="A1", point_m=(0.1, -0.05, 0.62)), False),
+        ({"slot": "E10", "toward": "bottom"}, SlotHint(slot="E10", toward="bottom"), False),
+        ({"slot": "E10", "point_m": [0, 0, 1]}, SlotHint(slot="E10", point_m=(0, 0, 1)), False),
+        ("previous", None, True),
+        ("A1@top-left,previous", SlotHint(slot="A1", toward="top-left"), True),
+    ],
+)
+def test_a_trial_takes_every_kind_of_hint(tmp_path, given, hint, previous):
+    session = load_session(write_session(tmp_path, trials=[trial(hint=given)]))
+    assert (session.trials[0].hint, session.trials[0].previous) == (hint, previous)
+
+
 def test_a_tube_that_is_named_in_two_ways_is_one_type(tmp_path):
     mine = load_tube("chen2023-tube-1").model_dump(mode="json", exclude_none=True)
     tubes = {"A1": "chen2023-tube-1", "B3": "mine.yaml"}
@@ -93,6 +110,9 @@ def test_labware_files_are_looked_for_in_the_session_folder(tmp_path):
         ({"trials": [trial(), trial()]}, "trial names must be unique, found twice: t1"),
         ({"trials": [trial(tubes={"Z9": "chen2023-tube-1"})]}, "trial t1: no slot Z9 in rack .* from A1 to E10"),
         ({"trials": [trial(hint={"slot": "K1", "pixel": [1, 2]})]}, "no slot K1"),
+        ({"trials": [trial(hint="K1@top")]}, "no slot K1"),
+        ({"trials": [trial(hint="A1@up")]}, r"hint A1@up: expected SLOT@U,V \(a pixel\), SLOT@WHERE"),
+        ({"trials": [trial(hint={"slot": "A1"})]}, "one of pixel, toward and point_m for its slot, found none of them"),
         ({"printed_cap": None}, "trial t1 has a printed capture, but the session names no printed_cap"),
     ],
 )

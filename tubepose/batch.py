@@ -12,7 +12,8 @@ from functools import partial
 from pathlib import Path
 
 from tubepose.capture.frame import RgbdFrame
-from tubepose.capture.session import Session, SlotHint, Trial
+from tubepose.capture.hints import SlotHint, TurnHint
+from tubepose.capture.session import Session, Trial
 from tubepose.capture.source import Capture, open_captures
 from tubepose.compiled import compilations
 from tubepose.config import Config
@@ -21,6 +22,7 @@ from tubepose.errors import CaptureError, TubePoseError, is_interrupt, kept
 from tubepose.labware import Labware, RackModel, TubeModel
 from tubepose.pipeline import DEFAULT_METHOD, STOCHASTIC, Scene, StageTime, TubeEstimate, estimate_tubes, prepare_scene
 from tubepose.rack import RackPose, RackStatus
+from tubepose.rack.turns import EarlierTurns
 from tubepose.records import Row, estimate_row, rack_pose_row, rack_row, sensor_row, slot_rows, timing_row
 from tubepose.transforms import FloatArray
 
@@ -37,11 +39,12 @@ class Job:
         capture: Where its frames come from.
         rack: The rack that stands in it.
         tubes: The kinds of tube that can stand in it.
-        hint: Which way round the rack stands, if known.
+        hint: Which way round the rack stands, if known; with `previous`, in the first frame whose turn is known.
         session: Name of its session, or empty.
         trial: Name of its trial, or empty.
         T_camera_rack: The rack's pose where it is known and not to be estimated, shape (4, 4), metres; else None.
         named_by_margin: By how much the rack was ahead of the catalogue's next one; NaN where a person named it.
+        previous: Whether a rack that was left alone since an earlier frame of the session stands as it did there.
     """
 
     capture: Capture
@@ -52,6 +55,7 @@ class Job:
     trial: str = ""
     T_camera_rack: FloatArray | None = None
     named_by_margin: float = float("nan")
+    previous: bool = False
 
 
 MOST_ASKED = 5
@@ -66,9 +70,10 @@ class UnnamedJob:
         capture: Where its frames come from.
         find_rack: Asked frame by frame until it names a rack, which then is the whole capture's; `MOST_ASKED` times.
         tubes: The kinds of tube that can stand in it.
-        hint: Which way round the rack stands, if known.
+        hint: As `Job.hint`.
         session: Name of its session, or empty.
         trial: Name of its trial, or empty.
+        previous: As `Job.previous`.
     """
 
     capture: Capture
@@ -77,6 +82,7 @@ class UnnamedJob:
     hint: SlotHint | None = None
     session: str = ""
     trial: str = ""
+    previous: bool = False
 
 
 MOST_WARMED = 5
@@ -131,7 +137,10 @@ def session_jobs(session: Session, *, fail_fast: bool = False) -> tuple[list[Job
     for trial in session.trials:
         with kept(None if fail_fast else problems):
             capture = trial_capture(session, trial, trial.original)
-            jobs.append(Job(capture, session.rack, session.tubes_of(trial), trial.hint, session.name, trial.name))
+            tubes = session.tubes_of(trial)
+            jobs.append(
+                Job(capture, session.rack, tubes, trial.hint, session.name, trial.name, previous=trial.previous)
+            )
     return jobs, problems
 
 
@@ -168,7 +177,7 @@ def run_jobs(
     """Run the methods on every frame of every job.
 
     Args:
-        jobs: What to run.
+        jobs: What to run, in the order in which hints say `previous`.
         methods: Names in `pipeline.METHODS`.
         detector_for: Makes the source of boxes for a rack and the tubes that can stand in it.
         config: All sections.
@@ -185,18 +194,23 @@ def run_jobs(
     """
     tables = Tables() if tables is None else tables
     warmed: dict[tuple[TubeModel, ...], int] = {}
+    earlier = EarlierTurns()
 
     def run(job: Job | UnnamedJob) -> None:
         for named, frame, load_ms in _named_frames(job, methods, tables):
+            hint: TurnHint | None = named.hint
+            if named.previous:
+                hint = earlier.hint(named.session, named.rack, named.hint, config.rack)
             tries = warmed.get(named.tubes, 0)
             if warm_up and tries < MOST_WARMED:
                 warm = Tables()
-                _run_frame(named, frame, methods, detector_for, config, seeds, warm, tables.timings)
+                _run_frame(named, frame, hint, methods, detector_for, config, seeds, warm, tables.timings)
                 # A frame without tubes warms half of it.
                 warmed[named.tubes] = MOST_WARMED if warm.estimates else tries + 1
             load = StageTime("load", "all", "", None, load_ms)
             rows, compiled = len(tables.timings), compilations()
-            _run_frame(named, frame, methods, detector_for, config, seeds, tables, None, load, on_scene)
+            pose = _run_frame(named, frame, hint, methods, detector_for, config, seeds, tables, None, load, on_scene)
+            earlier.learn(named.session, named.rack, named.hint, pose)
             if compilations() > compiled:
                 for row in tables.timings[rows:]:
                     row["warmup"] = True
@@ -242,7 +256,10 @@ def _named_frames(
                 if asked == MOST_ASKED:
                     break
                 continue
-            named = Job(job.capture, pose.rack, job.tubes, job.hint, job.session, job.trial, None, pose.named_by_margin)
+            named = Job(
+                job.capture, pose.rack, job.tubes, job.hint, job.session, job.trial, None, pose.named_by_margin,
+                job.previous,
+            )  # fmt: skip
         assert named is not None
         _check_hint(named)
         yield named, frame, load_ms
@@ -275,6 +292,7 @@ def _timed_frames(capture: Capture) -> Iterator[tuple[RgbdFrame, float]]:
 def _run_frame(
     job: Job,
     frame: RgbdFrame,
+    hint: TurnHint | None,
     methods: Sequence[str],
     detector_for: DetectorFactory,
     config: Config,
@@ -283,9 +301,10 @@ def _run_frame(
     warm_timings: list[Row] | None,
     load: StageTime | None = None,
     on_scene: Callable[[Job, Scene, tuple[TubeEstimate, ...]], None] | None = None,
-) -> None:
+) -> RackPose:
+    """Add a frame's rows to the tables; what is known of its rack."""
     detector = detector_for(job.rack, job.tubes)
-    scene = prepare_scene(frame, job.rack, job.tubes, detector, config, job.hint, job.T_camera_rack, methods)
+    scene = prepare_scene(frame, job.rack, job.tubes, detector, config, hint, job.T_camera_rack, methods)
     tables.labware[job.rack.name] = job.rack
     tables.labware |= {tube.name: tube for tube in job.tubes}
     keys = _keys(job, frame)
@@ -311,3 +330,4 @@ def _run_frame(
         on_scene(job, scene, shown)
     if scene.rack_pose.status is RackStatus.UNIT and warm_timings is None:
         raise CaptureError(scene.rack_pose.reason)
+    return scene.rack_pose

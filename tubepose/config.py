@@ -102,6 +102,9 @@ class RackConfig(_Section):
         max_in_slot_share: Largest share of such points: fitness alone accepts a rack of another pitch.
         min_coverage: Smallest share of the template that is seen.
         ambiguous_margin_m: Two turns whose rmse differ by less are not told apart by geometry.
+        left_alone_m: A corner of a rack's top that has moved farther since an earlier frame, metres, is one of a rack
+            that was handled, and may have been turned: hint `previous` decides nothing. Ten times the error of a pose,
+            less than half the pitch of most racks; what is lifted and put back by hand is seldom back so exactly.
         edge_margin_m: The same for method ``edges``, which judges a thinner layer: three pixels.
         max_stray_share: Largest share of such points. On `dev` the right rack has up to 5 %, whatever stands in it, a
             rack of another pitch 12 % or more.
@@ -146,6 +149,7 @@ class RackConfig(_Section):
     max_in_slot_share: float = 0.06
     min_coverage: float = 0.25
     ambiguous_margin_m: float = 5.0e-5
+    left_alone_m: float = Field(default=5.0e-3, gt=0)
     edge_margin_m: float = 6.0e-4
     max_stray_share: float = 0.08
     max_outside_share: float = 0.01

@@ -8,8 +8,8 @@ from typing import TypeGuard
 
 from tubepose.baselines import fit_global_icp, fit_slot_icp, fit_upright
 from tubepose.capture.frame import CameraIntrinsics, RgbdFrame
+from tubepose.capture.hints import TurnHint
 from tubepose.capture.registration import known_intrinsics, refuse_mirrored
-from tubepose.capture.session import SlotHint
 from tubepose.config import Config
 from tubepose.detection import Detection, Detector, points_in_box
 from tubepose.detection.assisted import AssistedDetector
@@ -49,7 +49,7 @@ def prepare_scene(
     tubes: Sequence[TubeModel],
     detector: Detector,
     config: Config,
-    hint: SlotHint | None = None,
+    hint: TurnHint | None = None,
     T_camera_rack: FloatArray | None = None,
     methods: Sequence[str] = tuple(TUBE_METHODS),
 ) -> Scene:
@@ -183,7 +183,7 @@ def _rack_pose(
     rack: RackModel,
     detections: Sequence[Detection],
     config: Config,
-    hint: SlotHint | None,
+    hint: TurnHint | None,
     intrinsics: CameraIntrinsics | None,
 ) -> RackPose:
     best = best_rack(detections)

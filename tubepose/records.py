@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
+from scipy.spatial.transform import Rotation
 
 from tubepose.capture.frame import RgbdFrame
 from tubepose.occupancy import held_slots, stated_slots
@@ -43,6 +44,7 @@ SLOT_COLUMNS = (
     "frame",
     "method",
     "slot",
+    "ambiguous",
     "state",
     "p_occupied",
     "seen_share",
@@ -53,8 +55,8 @@ SLOT_COLUMNS = (
     "reason",
 )
 ESTIMATE_COLUMNS = (
-    "session", "trial", "capture", "frame", "timestamp_ns", "method", "seed", "slot", "tube", "status", "reason",
-    "score", *POSE_COLUMNS, "tilt_deg", "inlier_rmse_m", "fitness", "n_points", *COVARIANCE_COLUMNS,
+    "session", "trial", "capture", "frame", "timestamp_ns", "method", "seed", "slot", "tube", "ambiguous", "status",
+    "reason", "score", *POSE_COLUMNS, "tilt_deg", "inlier_rmse_m", "fitness", "n_points", *COVARIANCE_COLUMNS,
 )  # fmt: skip
 TIMING_COLUMNS = (
     "session",
@@ -84,6 +86,18 @@ def pose_columns(T: FloatArray | None) -> Row:
     if T is None:
         return dict.fromkeys(POSE_COLUMNS, float("nan"))
     return dict(zip(POSE_COLUMNS, (*(float(value) for value in T[:3, 3]), *quaternion_wxyz(T)), strict=True))
+
+
+def transform_of(row: Row) -> FloatArray:
+    """The (4, 4) transform of a pose's columns, tx_m ... qz.
+
+    Raises:
+        ValueError: The row has no pose.
+    """
+    T = np.eye(4)
+    T[:3, :3] = Rotation.from_quat([row[name] for name in ("qx", "qy", "qz", "qw")]).as_matrix()
+    T[:3, 3] = [row[name] for name in ("tx_m", "ty_m", "tz_m")]
+    return T
 
 
 def rack_row(scene: Scene) -> Row:
@@ -143,7 +157,7 @@ def slot_rows(keys: Row, method: str, scene: Scene, estimates: Sequence[TubeEsti
     for name, stated in stated_slots(scene, estimates).items():
         estimate = held.get(name)
         said = {"state": stated.state.value, "p_occupied": stated.p_occupied, "seen_share": stated.seen_share}
-        row: Row = {**keys, "method": method, "slot": name, **said, "n_points": 0}
+        row: Row = {**keys, "method": method, "slot": name, "ambiguous": scene.rack_pose.ambiguous, **said, "n_points": 0}
         if estimate is not None:
             target = estimate.target
             row |= {
@@ -170,6 +184,7 @@ def estimate_row(keys: Row, scene: Scene, estimate: TubeEstimate) -> Row:
         "seed": estimate.seed,
         "slot": target.slot,
         "tube": target.tube.name if target.tube is not None else None,
+        "ambiguous": scene.rack_pose.ambiguous,
         "status": pose.status.value,
         "reason": pose.reason,
         "score": pose.score,

@@ -6,29 +6,17 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from tubepose.capture.description import Unit
+from tubepose.capture.hints import SlotHint, read_hint
 from tubepose.errors import CaptureError, LabwareError
 from tubepose.labware import CapModel, RackModel, TubeModel, load_cap, load_rack, load_tube, unique_tubes
 from tubepose.labware.reading import read_yaml, validate
 
 SESSION_FILE = "session.yaml"
-
-
-class SlotHint(BaseModel):
-    """Where a slot is seen in the image: tells the two turns of a symmetric rack apart.
-
-    Attributes:
-        slot: Name of the slot.
-        pixel: Its place (u, v) in the image; a click is exact enough.
-    """
-
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
-    slot: str
-    pixel: tuple[float, float]
 
 
 class Trial(BaseModel):
@@ -39,7 +27,9 @@ class Trial(BaseModel):
         tubes: Tube (name or file) per occupied slot.
         original: Capture with the original caps, relative to the session folder.
         printed: Capture with the printed caps, or None where there is no ground truth.
-        hint: Which way round the rack stands, if that was noted.
+        hint: Which way round the rack stands, if that was noted; in the file the keys of `SlotHint`, or a text as
+            `read_hint` takes it.
+        previous: Whether a rack that was left alone since an earlier trial stands as it did there; set by the text.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
@@ -48,6 +38,18 @@ class Trial(BaseModel):
     original: str
     printed: str | None = None
     hint: SlotHint | None = None
+    previous: bool = False
+
+    @model_validator(mode="before")
+    @classmethod
+    def _read_hint(cls, data: Any) -> Any:
+        if not isinstance(data, dict) or not isinstance(data.get("hint"), str):
+            return data
+        try:
+            hint = read_hint(data["hint"])
+        except ValueError as problem:
+            raise ValueError(f"hint {data['hint']}: {problem}") from None
+        return {"previous": hint.previous, **data, "hint": hint.place}
 
 
 class Topics(BaseModel):

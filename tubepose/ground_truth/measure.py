@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from tubepose.capture.frame import CameraIntrinsics, RgbdFrame
+from tubepose.capture.frame import RgbdFrame
+from tubepose.capture.hints import SlotHint, pointed_at
 from tubepose.capture.registration import known_intrinsics
-from tubepose.capture.session import SlotHint
 from tubepose.ground_truth.caps import Cap, find_caps
 from tubepose.ground_truth.model import GroundTruthConfig, GroundTruthResult, TubeTruth
 from tubepose.ground_truth.rack_top import find_rack, turns_of
@@ -84,7 +84,7 @@ def measure_ground_truth(
         rack: The rack in it.
         tubes: Tube model per slot, as the session declares them.
         cap: The printed cap that every tube wears.
-        hint: Where one slot is seen, which tells the turns of a rack apart when its caps do not; or None.
+        hint: Where one slot is, which tells the turns of a rack apart when its caps do not; or None.
         config: Thresholds.
 
     Returns:
@@ -102,8 +102,7 @@ def measure_ground_truth(
     turns = turns_of(T_camera_any, rack, config)
     placed = [[_place(found, T_camera_rack, scene) for found in caps] for T_camera_rack in turns]
     scores = [_score(in_turn, scene) for in_turn in placed]
-    intrinsics = None if hint is None else known_intrinsics(frame)
-    chosen, problem = _choose_turn(scores, [_hint_distance_m(intrinsics, turn, scene, hint) for turn in turns], config)
+    chosen, problem = _choose_turn(scores, _hinted_turn(frame, turns, scene, hint))
     if problem:
         return _refused(scene, problem, ambiguous=chosen is None)
     assert chosen is not None
@@ -143,9 +142,8 @@ def _score(placed: list[_Placed], scene: _Scene) -> int:
     return len(fitting) - sum(p.slot not in scene.tubes for p in good)
 
 
-def _choose_turn(scores: list[int], hint_m: list[float], config: GroundTruthConfig) -> tuple[int | None, str]:
+def _choose_turn(scores: list[int], hinted: int | None) -> tuple[int | None, str]:
     """The turn with the best agreement, by the hint among equals; a reason when they contradict or do not tell."""
-    hinted = _hinted_turn(hint_m, config)
     best = [turn for turn, score in enumerate(scores) if score == max(scores)]
     if len(best) == 1:
         if hinted is not None and hinted != best[0]:
@@ -156,22 +154,13 @@ def _choose_turn(scores: list[int], hint_m: list[float], config: GroundTruthConf
     return None, "ambiguous turn: the caps fit several turns of the rack equally, and no hint tells them apart"
 
 
-def _hinted_turn(hint_m: list[float], config: GroundTruthConfig) -> int | None:
-    order = np.argsort(hint_m)
-    first, second = hint_m[order[0]], hint_m[order[1]]
-    return int(order[0]) if np.isfinite(first) and second - first > config.hint_margin_m else None
-
-
-def _hint_distance_m(
-    intrinsics: CameraIntrinsics | None, T_camera_rack: FloatArray, scene: _Scene, hint: SlotHint | None
-) -> float:
-    """Distance of the hint to its slot's opening on the rack's top, metres; NaN without a hint or intrinsics."""
-    if hint is None or intrinsics is None:
-        return float("nan")
+def _hinted_turn(frame: RgbdFrame, turns: Sequence[FloatArray], scene: _Scene, hint: SlotHint | None) -> int | None:
+    """The turn that a hint means; None without one, and where it means none clearly."""
+    if hint is None:
+        return None
     opening = np.array([*scene.rack.slot(hint.slot).center_m, scene.rack.height_m])
-    in_camera = transform_points(T_camera_rack, opening)
-    offset_px = intrinsics.project(in_camera) - np.array(hint.pixel)
-    return float(np.linalg.norm(offset_px) * in_camera[2] / intrinsics.fx)
+    openings_m = np.stack([transform_points(T_camera_rack, opening) for T_camera_rack in turns])
+    return pointed_at(hint, openings_m, turns[0][:3, 2], known_intrinsics(frame))
 
 
 def _assign(T_camera_rack: FloatArray, placed: list[_Placed], scene: _Scene) -> GroundTruthResult:

@@ -46,7 +46,6 @@ class GroundTruthConfig:
         max_tilt_rad: More tilt than any slot allows: the cap sits crooked, or the plane is something else.
         slot_tolerance_m: How far a tube's bottom may lie from its slot's centre, beyond the rack's floor play.
         second_cap_share: A second candidate on a slot is a second cap from this share of the square's area.
-        hint_margin_m: The hint decides if it fits one turn better than the next by this much.
     """
 
     seed: int = 0
@@ -77,7 +76,6 @@ class GroundTruthConfig:
     max_tilt_rad: float = 0.174533
     slot_tolerance_m: float = 2.0e-3
     second_cap_share: float = 0.3
-    hint_margin_m: float = 5.0e-3
 
 
 @dataclass(frozen=True, slots=True, eq=False)

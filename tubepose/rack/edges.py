@@ -9,7 +9,7 @@ from itertools import islice
 import numpy as np
 
 from tubepose.capture.frame import CameraIntrinsics
-from tubepose.capture.session import SlotHint
+from tubepose.capture.hints import TurnHint
 from tubepose.checks import Check, reason
 from tubepose.config import Config, RackConfig, RackTopConfig
 from tubepose.labware import RackModel
@@ -34,7 +34,7 @@ CLEAR_TOPS = 0.6
 
 
 def register_edges(
-    points_m: FloatArray, rack: RackModel, config: Config, hint: SlotHint | None, intrinsics: CameraIntrinsics | None
+    points_m: FloatArray, rack: RackModel, config: Config, hint: TurnHint | None, intrinsics: CameraIntrinsics | None
 ) -> RackPose:
     """One try of `register_rack` by this method, without the suspicions of unit and noise."""
     if len(points_m) < MIN_POINTS:
@@ -50,7 +50,7 @@ def pose_of(
     points_m: FloatArray,
     rack: RackModel,
     config: Config,
-    hint: SlotHint | None,
+    hint: TurnHint | None,
     intrinsics: CameraIntrinsics | None,
 ) -> RackPose:
     """What to report of the best registration."""
@@ -194,7 +194,7 @@ def _pose(
     points_m: FloatArray,
     rack: RackModel,
     config: Config,
-    hint: SlotHint | None,
+    hint: TurnHint | None,
     intrinsics: CameraIntrinsics | None,
 ) -> RackPose:
     turns = turns_of(best, points_m, rack, config.rack)

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 from tubepose.capture.frame import CameraIntrinsics
-from tubepose.capture.session import SlotHint
+from tubepose.capture.hints import SlotHint
 from tubepose.config import Config
 from tubepose.labware import RackModel, catalogue
 from tubepose.preprocessing import unit_doubt

@@ -15,7 +15,7 @@ import open3d as o3d
 from scipy.spatial import cKDTree
 
 from tubepose.capture.frame import CameraIntrinsics
-from tubepose.capture.session import SlotHint
+from tubepose.capture.hints import TurnHint
 from tubepose.config import Config, RackConfig
 from tubepose.labware import RackModel
 from tubepose.preprocessing import (
@@ -54,7 +54,7 @@ def rack_template_m(rack: RackModel, spacing_m: float) -> FloatArray:
 
 
 def register_obb_icp(
-    points_m: FloatArray, rack: RackModel, config: Config, hint: SlotHint | None, intrinsics: CameraIntrinsics | None
+    points_m: FloatArray, rack: RackModel, config: Config, hint: TurnHint | None, intrinsics: CameraIntrinsics | None
 ) -> RackPose:
     """One try of `register_rack` by this method, without the suspicions of unit and noise."""
     if len(points_m) < MIN_POINTS:

@@ -10,7 +10,7 @@ from collections.abc import Callable
 from dataclasses import replace
 
 from tubepose.capture.frame import CameraIntrinsics
-from tubepose.capture.session import SlotHint
+from tubepose.capture.hints import TurnHint
 from tubepose.config import Config
 from tubepose.labware import RackModel
 from tubepose.preprocessing import level_noise_m, plausible_unit_factors, thin
@@ -21,7 +21,7 @@ from tubepose.rack.pose import MIN_POINTS, RackPose, RackStatus
 from tubepose.transforms import FloatArray
 
 _Method = Callable[
-    [FloatArray, RackModel, Config, SlotHint | None, CameraIntrinsics | None],
+    [FloatArray, RackModel, Config, TurnHint | None, CameraIntrinsics | None],
     RackPose,
 ]
 # Points that tell a smooth scan, or a rough one, from a doubtful one, and shares of the limit where they do.
@@ -34,7 +34,7 @@ def register_rack(
     points_m: FloatArray,
     rack: RackModel,
     config: Config,
-    hint: SlotHint | None = None,
+    hint: TurnHint | None = None,
     intrinsics: CameraIntrinsics | None = None,
 ) -> RackPose:
     """Estimate a rack's pose from the points that a detector gave it.
@@ -44,8 +44,8 @@ def register_rack(
             or the whole frame.
         rack: The rack's definition.
         config: Sections preprocess, rack_top and rack are used; `rack.method` names the method.
-        hint: Where a slot is seen in the image, to tell the two turns apart.
-        intrinsics: Of that image; without them the hint is not used.
+        hint: Where a slot is or where the rack stood before, to tell its turns apart.
+        intrinsics: Of the image that a pixel of the hint is of; without them it is not used.
     """
     method = _METHODS[config.rack.method]
     pose = method(points_m, rack, config, hint, intrinsics)

@@ -8,12 +8,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from tubepose.capture.frame import CameraIntrinsics
-from tubepose.capture.session import SlotHint
+from tubepose.capture.hints import EarlierRack, SlotHint, TurnHint, pointed_at, word_of
 from tubepose.checks import Check
 from tubepose.config import RackConfig
 from tubepose.labware import RackModel
 from tubepose.rack.agreement import Agreement, measure_agreement
 from tubepose.rack.field import top_field
+from tubepose.rack.pose import RackPose
 from tubepose.rack.settling import Registration, register_at
 from tubepose.rack.size import FaceSize
 from tubepose.transforms import HALF_TURN, QUARTER_TURN, FloatArray, transform_points
@@ -92,7 +93,7 @@ def choose_turn(
     margin_m: float,
     rack: RackModel,
     config: RackConfig,
-    hint: SlotHint | None,
+    hint: TurnHint | None,
     intrinsics: CameraIntrinsics | None,
 ) -> tuple[int, str]:
     """Which of two or four turns to report, and what decided.
@@ -102,20 +103,19 @@ def choose_turn(
         margin_m: Rmse of the next best one minus that of the best one, metres.
         rack: The rack.
         config: What margin decides.
-        hint: Where a slot is seen.
-        intrinsics: Of the image that the hint speaks of.
+        hint: Where a slot is, or where the rack stood before.
+        intrinsics: Of the image that a pixel of the hint speaks of.
     """
     if margin_m > config.ambiguous_margin_m:
         return 0, "geometry"
-    if hint is not None and intrinsics is not None:
-        pixels = _hinted(T_camera_turns, rack, hint, intrinsics)
-        distances = np.hypot(*(pixels - np.array(hint.pixel)).T)
-        nearest = int(distances.argmin())
-        others = np.arange(len(distances)) != nearest
-        # A hint far from all places says nothing: swapped coordinates, or a pixel of another image.
-        near = 0.25 * np.hypot(*(pixels[others] - pixels[nearest]).T)
-        if (distances[nearest] < near).all() and (near < distances[others] - distances[nearest]).all():
-            return nearest, "hint"
+    if isinstance(hint, EarlierRack):
+        unmoved = np.flatnonzero(_moved_m(hint.T_camera_rack, T_camera_turns, rack) <= hint.within_m)
+        if len(unmoved) == 1:
+            return int(unmoved[0]), "previous"
+    elif hint is not None:
+        told = pointed_at(hint, _openings_m(T_camera_turns, rack, hint.slot), T_camera_turns[0][:3, 2], intrinsics)
+        if told is not None:
+            return told, "hint"
     # Decided by the image's diagonal: racks stand along the image's sides more often than along its diagonal.
     return int(np.argmax([T[:2, 0].sum() for T in T_camera_turns])), "rule"
 
@@ -124,26 +124,128 @@ def unused_hint(
     T_camera_given: FloatArray,
     T_camera_others: Sequence[FloatArray],
     rack: RackModel,
-    hint: SlotHint | None,
+    hint: TurnHint | None,
     intrinsics: CameraIntrinsics | None,
 ) -> str:
     """Why a hint has not decided between the turn that is given and the others, in words; empty without a hint."""
     if hint is None:
         return ""
-    if intrinsics is None:
-        return f"the hint for {hint.slot} is a pixel, and this cloud has none: give an organised cloud or an image"
-    (u, v), *others = _hinted([T_camera_given, *T_camera_others], rack, hint, intrinsics)
-    turned = " or ".join(f"{other_u:.0f},{other_v:.0f}" for other_u, other_v in others)
+    T_camera_turns = [T_camera_given, *T_camera_others]
+    if isinstance(hint, EarlierRack):
+        return _earlier_words(hint, T_camera_turns, rack)
+    if hint.pixel is not None and intrinsics is None:
+        return (
+            f"the hint for {hint.slot} is a pixel, and this cloud has none: give an organised cloud or an image, or a "
+            f"hint without pixels, as {hint.slot}@top-left"
+        )
+    return _place_words(hint, _openings_m(T_camera_turns, rack, hint.slot), intrinsics)
+
+
+def _earlier_words(hint: EarlierRack, T_camera_turns: Sequence[FloatArray], rack: RackModel) -> str:
+    do = "give a hint for this capture"
+    if hint.T_camera_rack is None:
+        return f"{hint.reason}: {do}"
+    moved_m, limit_mm = _moved_m(hint.T_camera_rack, T_camera_turns, rack).min(), f"{hint.within_m * 1e3:g} mm"
+    if moved_m <= hint.within_m:
+        return f"a turn of this rack moves it by less than {limit_mm}: {do}"
     return (
-        f"the hint says that {hint.slot} is seen at {hint.pixel[0]:.0f},{hint.pixel[1]:.0f}, but it is at "
-        f"{u:.0f},{v:.0f} in the pose given or, the rack turned, at {turned}: point nearer to one of them, in pixels "
-        "of the capture's image (an overlay is cut and scaled)"
+        f"the rack has moved by {moved_m * 1e3:.1f} mm or more since its turn was last known, at most {limit_mm} "
+        f"expected of one that was left alone: {do}"
     )
 
 
-def _hinted(
-    T_camera_turns: Sequence[FloatArray], rack: RackModel, hint: SlotHint, intrinsics: CameraIntrinsics
-) -> FloatArray:
-    """Pixels (K, 2) where the hint's slot is seen in each turn."""
-    point = np.array([*rack.slot(hint.slot).center_m, rack.height_m])
-    return np.stack([intrinsics.project(transform_points(T, point)) for T in T_camera_turns])
+def _place_words(hint: SlotHint, openings_m: FloatArray, intrinsics: CameraIntrinsics | None) -> str:
+    """What a hint says, and where its slot is in the pose given and the others."""
+    if hint.toward is not None:
+        words = [word_of(openings_m, k) for k in range(len(openings_m))]
+        if None in words:
+            return f"{hint.slot} is at nearly the same place however the rack is turned: name a slot at a corner"
+        turned = " or ".join(str(word) for word in words[1:])
+        return (
+            f"the hint says that {hint.slot} is seen at the {hint.toward}, which does not tell its places apart: it is "
+            f"at the {words[0]} in the pose given or, the rack turned, at the {turned}"
+        )
+    if hint.point_m is not None:
+        said, (given, *others) = _numbers(hint.point_m, 3), [_numbers(place, 3) for place in openings_m]
+        do = "give a point nearer to one of them, in metres, in the camera frame"
+    else:
+        assert hint.pixel is not None
+        assert intrinsics is not None
+        pixels = intrinsics.project(openings_m)
+        said, (given, *others) = _numbers(hint.pixel, 0), [_numbers(place, 0) for place in pixels]
+        do = "point nearer to one of them, in pixels of the capture's image (an overlay is cut and scaled)"
+    return (
+        f"the hint says that {hint.slot} is seen at {said}, but it is at {given} in the pose given or, the rack "
+        f"turned, at {' or '.join(others)}: {do}"
+    )
+
+
+def _numbers(place: Sequence[float] | FloatArray, digits: int) -> str:
+    return ",".join(f"{value:.{digits}f}" for value in place)
+
+
+def example_hints(T_camera_rack: FloatArray, rack: RackModel) -> tuple[str, ...]:
+    """Hints that tell the turns of a rack apart, that of the pose given first; none where no slot's place does.
+
+    Args:
+        T_camera_rack: The pose given, shape (4, 4), metres.
+        rack: The rack.
+    """
+    alike = max(top_field(rack).alike, 2)
+    T_camera_turns = [T_camera_rack @ np.linalg.matrix_power(QUARTER_TURN, 4 // alike * k) for k in range(alike)]
+    for slot in rack.all_slots:
+        openings_m = _openings_m(T_camera_turns, rack, slot.name)
+        words = [word_of(openings_m, k) for k in range(alike)]
+        if None not in words:
+            return tuple(f"{slot.name}@{word}" for word in words)
+    return ()
+
+
+class EarlierTurns:
+    """Where racks stood in earlier frames in which their turn was known: by geometry, a hint, or an earlier frame."""
+
+    def __init__(self) -> None:
+        self._last: dict[str, tuple[str, FloatArray]] = {}
+        self._used: list[SlotHint] = []
+
+    def hint(self, group: str, rack: RackModel, place: SlotHint | None, config: RackConfig) -> TurnHint:
+        """The hint for the next frame: a place, until a frame's turn was known with it; then where the rack stood.
+
+        Args:
+            group: What has frames in common: a session.
+            rack: The rack in the frame.
+            place: Where one of its slots is in the first frame; one object for all captures that it is said once for.
+            config: How far a rack moves that is left alone.
+        """
+        if place is not None and not any(place is used for used in self._used):
+            return place
+        if group not in self._last:
+            return EarlierRack(None, config.left_alone_m, "the turn of the rack was known in no earlier frame")
+        name, T_camera_rack = self._last[group]
+        if name != rack.name:
+            return EarlierRack(None, config.left_alone_m, f"the last rack whose turn was known was another one, {name}")
+        return EarlierRack(T_camera_rack, config.left_alone_m)
+
+    def learn(self, group: str, rack: RackModel, place: SlotHint | None, pose: RackPose) -> None:
+        """Keep a frame's pose, and that its place was of use, if the turn is known."""
+        if pose.T_camera_rack is not None and not pose.ambiguous:
+            self._last[group] = rack.name, pose.T_camera_rack
+            if place is not None:
+                self._used.append(place)
+
+
+def _openings_m(T_camera_turns: Sequence[FloatArray], rack: RackModel, slot: str) -> FloatArray:
+    """Where a slot's opening is in each turn, shape (K, 3), camera frame, metres."""
+    opening = np.array([*rack.slot(slot).center_m, rack.height_m])
+    return np.stack([transform_points(T, opening) for T in T_camera_turns])
+
+
+def _moved_m(T_camera_before: FloatArray | None, T_camera_turns: Sequence[FloatArray], rack: RackModel) -> FloatArray:
+    """How far the corner of the top that moved farthest has moved, if a turn is that of before, shape (K,), metres."""
+    if T_camera_before is None:
+        return np.full(len(T_camera_turns), np.inf)
+    signs = np.array([[-1, -1], [-1, 1], [1, -1], [1, 1]])
+    corners = np.column_stack([signs * rack.outline_m / 2, np.full(4, rack.height_m)])
+    before = transform_points(T_camera_before, corners)
+    off = [np.linalg.norm(transform_points(T, corners) - before, axis=1).max() for T in T_camera_turns]
+    return np.array(off)
