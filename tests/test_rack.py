@@ -425,7 +425,7 @@ def test_noisy_depth_is_insufficient(soft_scan):
         ({"min_slot_margin": 1e9}, "slot_step"),
         ({"max_turn_std_deg": 0.0}, "uncertain_turn"),
         ({"max_shift_std_mm": 0.0}, "uncertain_shift"),
-        ({"max_gain": -1e9, "min_gain_sigmas": -1e9}, "no_openings"),
+        ({"max_gain": -1e9}, "no_openings"),
         ({"max_pitch_mm": -1e9}, "pitch_x"),
         ({"max_openings_mm": -1e9}, "openings"),
         ({"max_outline_mm": -1e9}, "outline"),

@@ -62,6 +62,10 @@ SENTENCES = {
     "tubes_beside": (
         "{value:.0f} of the places beside the slots of {name}, where {detail} would be, are full: another rack, or its file"
     ),
+    "tops_off_slots": (
+        "what stands up lies {value:.2f} of the distance of slots off the slots of {name}, at most {limit:g} expected: "
+        "its slots are elsewhere; another rack?"
+    ),
     "pitch_x": (
         "the slots lie {detail} along x than those of {name}: {value:.2f} mm at the outermost one, at most {limit:g} mm "
         "expected: another rack, correct pitch_mm, or the cloud's scale"

@@ -110,15 +110,17 @@ class RackConfig(_Section):
             rack of another pitch 12 % or more.
         max_outside_share: Largest share of the top's points just outside the outline (right rack: 0.1 %).
         max_gain: Nats by which a named alternative (a row or column more or fewer, no openings, another rack of the
-            catalogue) may be likelier than the rack, where it is so in more than one square (min_gain_sigmas).
-        min_gain_sigmas: An alternative counts if its gain is so many of its standard deviations over squares of 20 mm.
+            catalogue) may be likelier than the rack. On simulated racks with the right file it was 39 at most, with a
+            wrong one that shows 90 or more.
         max_pitch_mm: How far the outermost slots may lie from where the rack's file has them, because of another pitch;
-            beyond three standard deviations of its measurement, as the three limits below. Half of what a wrong answer is.
-        max_openings_mm: How much wider or narrower openings may be. Sensors' blur moves their edges by up to 0.6 mm each.
+            beyond three standard deviations of its measurement, as with those below. Half of what a wrong answer is.
+        max_openings_mm: How much wider or narrower openings may be: blur moves their edges by up to 0.6 mm each.
         max_outline_mm: How much larger or smaller the outline may be.
         max_scale: Largest difference of scale, as a share, of everything that is seen of the rack.
         max_scale_shift_mm: A difference of scale that moves the rack by more along the line of sight is marked.
         edge_std_mm: How far a sensor's blur and a projector's shadow move the edge of an outline.
+        max_tops_off: How far the tops of what stands in the slots may lie from the slots' centres, root of the mean square
+            as a share of the distance of slots: tubes lean by less than a tenth, and tops anywhere give 0.38.
         max_bow_mm: Largest bow of a face, at the ends of its outline (two of two real racks: 0.7 to 2 mm).
         max_floor_mm: How far the slots' floor may be seen from where the file has it, beside three standard deviations.
         min_seen: Smallest share of the template that is seen: a rack full of caps shows 5 to 24 %.
@@ -153,14 +155,14 @@ class RackConfig(_Section):
     edge_margin_m: float = 6.0e-4
     max_stray_share: float = 0.08
     max_outside_share: float = 0.01
-    max_gain: float = 50.0
-    min_gain_sigmas: float = 1.5
+    max_gain: float = 60.0
     max_pitch_mm: float = 1.0
     max_openings_mm: float = 2.0
     max_outline_mm: float = 6.0
     max_scale: float = 0.0075
     max_scale_shift_mm: float = 2.0
     edge_std_mm: float = 0.3
+    max_tops_off: float = 0.25
     max_bow_mm: float = 4.0
     max_floor_mm: float = 2.0
     min_seen: float = 0.1

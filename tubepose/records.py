@@ -157,7 +157,14 @@ def slot_rows(keys: Row, method: str, scene: Scene, estimates: Sequence[TubeEsti
     for name, stated in stated_slots(scene, estimates).items():
         estimate = held.get(name)
         said = {"state": stated.state.value, "p_occupied": stated.p_occupied, "seen_share": stated.seen_share}
-        row: Row = {**keys, "method": method, "slot": name, "ambiguous": scene.rack_pose.ambiguous, **said, "n_points": 0}
+        row: Row = {
+            **keys,
+            "method": method,
+            "slot": name,
+            "ambiguous": scene.rack_pose.ambiguous,
+            **said,
+            "n_points": 0,
+        }
         if estimate is not None:
             target = estimate.target
             row |= {

@@ -56,14 +56,11 @@ class Gain:
         code: Of the alternative.
         words: What it is.
         nats: Difference of the log likelihoods, negative where the rack is likelier.
-        sigmas: The same over its standard deviation from one square of `CLUSTER_M` to the next (Vuong's test): cells of
-            a square err alike, and one square that is astray proves nothing.
     """
 
     code: str
     words: str
     nats: float
-    sigmas: float
 
 
 def gains(face: Face, rack: RackModel) -> tuple[Gain, ...]:
@@ -75,7 +72,6 @@ def gains(face: Face, rack: RackModel) -> tuple[Gain, ...]:
     """
     own_m = own_distance_m(rack, face.grid)
     rates = face.rates(own_m)
-    square, count = squares(face.grid)
     best: dict[str, Gain] = {}
     for other in alternatives(rack, face.grid):
         more = face.log_likelihood(other.distance_m, rates, other.rows)
@@ -86,8 +82,7 @@ def gains(face: Face, rack: RackModel) -> tuple[Gain, ...]:
             more = np.where(nothing, 0.0, more)
         nats = float(more.sum())
         if other.code not in best or nats > best[other.code].nats:
-            spread = float(np.sqrt((np.bincount(square[other.rows], more, count) ** 2).sum()))
-            best[other.code] = Gain(other.code, other.words, nats, nats / max(spread, 1e-9))
+            best[other.code] = Gain(other.code, other.words, nats)
     return tuple(best.values())
 
 
@@ -147,20 +142,21 @@ def _distances(rack: RackModel, grid: Grid) -> Iterator[tuple[str, str, FloatArr
     steps = line_steps_m(rack)
     for side, sign in SIDES.items():
         axis = 0 if sign[0] else 1
-        if steps[axis] is None:
+        step = steps[axis]
+        if step is None:
             continue
-        step_m = np.array(sign) * steps[axis]
+        step_m = np.array(sign) * step
         edge = edge_slots(slots, step_m)
         what = "column" if axis == 0 else "row"
         moved = [_moved(slot, step_m) for slot in edge]
-        grown_m = _to_outline_m(rack, grid, sign, float(steps[axis]))
+        grown_m = _to_outline_m(rack, grid, sign, step)
         with_more = _to_openings_m((*slots, *moved), grid)
         yield f"{what}_more", f"a {what} of slots more at {side}", np.maximum(grown_m, with_more)
         if _fits(rack, moved):
             yield f"{what}_more", f"a {what} of slots more at {side}", np.maximum(outline_m, with_more)
         fewer = tuple(slot for slot in slots if slot not in edge)
         if fewer:
-            cut_m = _to_outline_m(rack, grid, sign, -float(steps[axis]))
+            cut_m = _to_outline_m(rack, grid, sign, -step)
             without = _to_openings_m(fewer, grid)
             yield f"{what}_fewer", f"a {what} of slots fewer at {side}", np.maximum(cut_m, without)
             yield f"{what}_fewer", f"a {what} of slots fewer at {side}", np.maximum(outline_m, without)

@@ -115,7 +115,7 @@ def best_registration(
         if not _known(registration.fit.T_camera_rack, been, rack):
             found.append(registration)
             been.append(registration.fit.T_camera_rack)
-    return _likeliest(found, rack, config.rack)
+    return _likeliest(found, config.rack)
 
 
 def _clear(registration: Registration, rack: RackModel, config: RackConfig) -> bool:
@@ -129,7 +129,7 @@ def _uncontradicted(registration: Registration, config: RackConfig) -> bool:
     return registration.agreement.in_slot <= config.max_stray_share / 2
 
 
-def _likeliest(found: list[Registration], rack: RackModel, config: RackConfig) -> Registration | None:
+def _likeliest(found: list[Registration], config: RackConfig) -> Registration | None:
     found = sorted(found, key=lambda r: (bool(r.reason), -r.agreement.evidence))
     if len(found) < 2 or found[1].reason:
         return found[0] if found else None

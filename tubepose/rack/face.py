@@ -32,7 +32,7 @@ SHADOW_M = 20e-3
 BLUR_M = 0.4e-3
 # Points nearer than this share their label's error: they count as one.
 INDEPENDENT_M = 1.5e-3
-# A cell this far from every edge tells how often nothing returns from solid parts (ribs are 1 mm wide), and from open ones.
+# A cell this far from every edge tells how often nothing returns from solid parts (ribs are 1 mm wide) and open ones.
 INSIDE_M, OPEN_M = 0.4e-3, 1.0e-3
 # Share of cells without a return that is assumed before any were counted, and how many cells an assumption is worth.
 NOTHING, PRIOR_CELLS = 0.3, 20.0

@@ -98,7 +98,7 @@ def _to_outline(x: FloatArray, y: FloatArray, rack: RackModel) -> FloatArray:
     half = rack.outline_m / 2
     edge = np.stack(np.broadcast_arrays(np.abs(x)[:, None] - half[0], np.abs(y)[None] - half[1]))
     outside = np.hypot(*np.maximum(edge, 0))
-    return np.maximum(outside + np.minimum(edge.max(axis=0), 0), -REACH_M)
+    return np.asarray(np.maximum(outside + np.minimum(edge.max(axis=0), 0), -REACH_M))
 
 
 def _to_openings(x: FloatArray, y: FloatArray, rack: RackModel) -> FloatArray:

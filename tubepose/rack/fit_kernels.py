@@ -1,8 +1,8 @@
 """One round of a rack's fit, compiled: the plane of its top, its bow, and its edges; see `kernels`.
 
-Heights of points on the solid part give the plane and the bow. The edges give the rest: a point at the top's height must lie on the
-solid part, whose signed distance says how far off it is, less the blur of the sensor. Points on opposite edges of ribs
-push in opposite directions, so a blur that makes every rib look wider, or thinner, moves no pose.
+Heights of points on the solid part give the plane and the bow. The edges give the rest: a point at the top's height
+must lie on the solid part, whose signed distance says how far off it is, less the blur of the sensor. Points on
+opposite edges of ribs push in opposite directions, so a blur that makes every rib look wider, or thinner, moves no pose.
 """
 
 from __future__ import annotations

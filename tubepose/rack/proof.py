@@ -15,6 +15,7 @@ from tubepose.rack.face import Face, face_grid, look_at_face
 from tubepose.rack.field import openings_field
 from tubepose.rack.fit import Fit, to_frame, top_frame
 from tubepose.rack.size import FaceSize, measure_size
+from tubepose.rack.tops_in_slots import LEAST_TOPS, TopsInSlots, tops_in_slots
 from tubepose.transforms import FloatArray
 
 # Half thickness of what counts as the face: so many standard deviations of its heights, between these.
@@ -25,8 +26,8 @@ BESIDE_M = 30e-3
 _UNITS = (("uncertain_turn", np.rad2deg(1.0), slice(0, 3)), ("uncertain_shift", 1e3, slice(3, 6)))
 # A pose that is known no better than this is not known at all.
 LOST_DEG = 45.0
-# The middle of a place for a tube, as a share of the distance of slots, and the share of it that a tube fills.
-CORE, FULL = 0.3, 0.6
+# The middle of a place for a tube, half its side as a share of the distance of slots, and what a tube fills of it.
+CORE, FULL = 0.25, 0.6
 # A floor is seen in slots with so many points, this near to each other in height, away from walls and from the face.
 FLOOR_POINTS = 12
 FLAT_M = 0.8e-3
@@ -55,9 +56,15 @@ def prove(
     window_m = float(np.clip(FACE_SIGMAS * fit.scatter_m, *FACE_M))
     grid = face_grid(rack, seen.spacing_m, BESIDE_M)
     face = look_at_face(points_m, fit.T_camera_rack, rack, window_m, grid, seen.spacing_m)
-    size = measure_size(face, rack)
+    tops = tops_in_slots(points_m, top_frame(fit.T_camera_rack, rack), fit.bow_m, rack)
+    size = measure_size(face, rack).with_tops(tops)
     distance_m = float(np.linalg.norm(top_frame(fit.T_camera_rack, rack)[:3, 3]))
-    checks += (*_alternatives(face, rack, config), *_beside(face, rack), *_sizes(size, rack, config))
+    checks += (
+        *_alternatives(face, rack, config),
+        *_beside(face, rack),
+        *_tops(tops, config),
+        *_sizes(size, rack, config),
+    )
     floor_m = measure_floor(points_m, fit, rack)
     return (*checks, *_scale(size, rack, distance_m, config), *_floor(floor_m, rack, config)), size, floor_m
 
@@ -87,13 +94,11 @@ def _quick(seen: Agreement, fit: Fit, config: RackConfig) -> Iterator[Check]:
 
 def _alternatives(face: Face, rack: RackModel, config: RackConfig) -> Iterator[Check]:
     for gain in gains(face, rack):
-        worse = gain.nats <= config.max_gain or gain.sigmas <= config.min_gain_sigmas
-        yield Check(gain.code, gain.nats, config.max_gain, worse, detail=gain.words)
+        yield Check(gain.code, gain.nats, config.max_gain, gain.nats <= config.max_gain, detail=gain.words)
 
 
 def _beside(face: Face, rack: RackModel) -> Iterator[Check]:
     """Tubes that stand where another line of slots would be: full places in more than one slot of it."""
-    xy = face.grid.centers_m
     steps = line_steps_m(rack)
     for side, sign in SIDES.items():
         axis = 0 if sign[0] else 1
@@ -102,10 +107,21 @@ def _beside(face: Face, rack: RackModel) -> Iterator[Check]:
             continue
         full = 0
         for slot in edge_slots(rack.all_slots, np.array(sign) * step):
-            core = np.hypot(*(xy - slot.center_m - np.array(sign) * step).reshape(-1, 2).T) < CORE * step
-            full += bool(core.any()) and float(face.standing.ravel()[core].mean()) > FULL
+            low, high = (
+                np.floor(
+                    (slot.center_m + np.array(sign) * step - face.grid.low_m) / face.grid.cell_m + side_cells
+                ).astype(int)
+                for side_cells in (0.5 - CORE * step / face.grid.cell_m, 0.5 + CORE * step / face.grid.cell_m)
+            )
+            core = face.standing[max(low[0], 0) : max(high[0], 0), max(low[1], 0) : max(high[1], 0)]
+            full += core.size > 0 and float(core.mean()) > FULL
         what = "column" if axis == 0 else "row"
         yield Check("tubes_beside", full, 1, full <= 1, detail=f"a {what} more at {side}")
+
+
+def _tops(tops: TopsInSlots, config: RackConfig) -> Iterator[Check]:
+    if tops.count >= LEAST_TOPS:
+        yield Check("tops_off_slots", tops.rms_share, config.max_tops_off, tops.rms_share <= config.max_tops_off)
 
 
 def _sizes(size: FaceSize, rack: RackModel, config: RackConfig) -> Iterator[Check]:

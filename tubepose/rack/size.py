@@ -17,6 +17,7 @@ from tubepose.rack import size_kernels
 from tubepose.rack.alternatives import own_distance_m, squares
 from tubepose.rack.face import INSIDE_M, Face
 from tubepose.rack.field import GRID_M, openings_field, outline_field
+from tubepose.rack.tops_in_slots import TopsInSlots
 from tubepose.transforms import FloatArray
 
 # Blurs of the rounds, and how many rounds each has: the first reaches over the width of a rib.
@@ -63,6 +64,18 @@ class FaceSize:
         pick = np.array([0, 0, 1.0, 0.5, 0.5])
         value = self.openings_m + float(self.outline_m.mean())
         return value, float(np.sqrt(pick @ self.covariance @ pick))
+
+    def with_tops(self, tops: TopsInSlots) -> FaceSize:
+        """The same, its stretch weighed with that of tops in the slots (inverse variances, axis by axis)."""
+        # What the tops say of the stretch, as one more measurement of each: Kalman's update.
+        mean = np.concatenate([self.stretch, [self.openings_m], self.outline_m])
+        covariance = self.covariance
+        for axis in range(2):
+            if np.isfinite(tops.std[axis]):
+                gain = covariance[:, axis] / (covariance[axis, axis] + tops.std[axis] ** 2)
+                mean = mean + gain * (tops.stretch[axis] - mean[axis])
+                covariance = covariance - np.outer(gain, covariance[axis])
+        return FaceSize(mean[:2], float(mean[2]), mean[3:], covariance)
 
     def quarter_turned(self) -> FaceSize:
         """The same with x and y changed."""

@@ -128,7 +128,8 @@ def _surface(uv: FloatArray, heights_m: FloatArray) -> tuple[FloatArray, FloatAr
         found = np.linalg.solve(normal, design.T @ heights_m)
         off = heights_m - design @ found
         spare = max(len(off) - (6 if bowed else 3), 1)
-        fits.append((found, INFLATE**2 * float(off @ off) / spare * np.linalg.inv(normal), off))
+        covariance = INFLATE**2 * float(off @ off) / spare * np.linalg.inv(normal)
+        fits.append((np.asarray(found), np.asarray(covariance), off))
     bowed_fit, flat_fit = fits
     bow = bowed_fit[0][3:]
     significant = bow @ np.linalg.solve(bowed_fit[1][3:, 3:], bow) > FLAT_CHI2
