@@ -43,7 +43,7 @@ class Job:
         session: Name of its session, or empty.
         trial: Name of its trial, or empty.
         T_camera_rack: The rack's pose where it is known and not to be estimated, shape (4, 4), metres; else None.
-        named_by_margin: By how much the rack was ahead of the catalogue's next one; NaN where a person named it.
+        named_by_nats: By how much the rack was ahead of the catalogue's next one; NaN where a person named it.
         previous: Whether a rack that was left alone since an earlier frame of the session stands as it did there.
     """
 
@@ -54,7 +54,7 @@ class Job:
     session: str = ""
     trial: str = ""
     T_camera_rack: FloatArray | None = None
-    named_by_margin: float = float("nan")
+    named_by_nats: float = float("nan")
     previous: bool = False
 
 
@@ -257,7 +257,7 @@ def _named_frames(
                     break
                 continue
             named = Job(
-                job.capture, pose.rack, job.tubes, job.hint, job.session, job.trial, None, pose.named_by_margin,
+                job.capture, pose.rack, job.tubes, job.hint, job.session, job.trial, None, pose.named_by_nats,
                 job.previous,
             )  # fmt: skip
         assert named is not None
@@ -320,9 +320,7 @@ def _run_frame(
             if method == shown_method and seed in (None, 0):
                 shown = estimates
             if seed in (None, 0):
-                tables.racks.append(
-                    {**keys, "method": method, **rack_row(scene), "named_by_margin": job.named_by_margin}
-                )
+                tables.racks.append({**keys, "method": method, **rack_row(scene), "named_by_nats": job.named_by_nats})
                 tables.slots += slot_rows(keys, method, scene, estimates)
     timings = tables.timings if warm_timings is None else warm_timings
     timings += [timing_row(keys, entry, warm_timings is not None) for entry in times]

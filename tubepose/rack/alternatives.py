@@ -27,8 +27,10 @@ SIDES = {"+x": (1, 0), "-x": (-1, 0), "+y": (0, 1), "-y": (0, -1)}
 FAR_M = 1.0
 # Racks whose sides differ by less look alike at a first look.
 ALIKE_M = 6e-3
-# Light that goes astray is alike over a slot and its ribs.
+# Light that goes astray is alike over a slot and its ribs, and what returns nothing does so in whole patches: one of
+# them speaks for an alternative by no more than this, nats.
 CLUSTER_M = 20e-3
+MOST_MISSED = 10.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -72,15 +74,14 @@ def gains(face: Face, rack: RackModel) -> tuple[Gain, ...]:
     """
     own_m = own_distance_m(rack, face.grid)
     rates = face.rates(own_m)
+    square, count = squares(face.grid)
     best: dict[str, Gain] = {}
     for other in alternatives(rack, face.grid):
         more = face.log_likelihood(other.distance_m, rates, other.rows)
         more -= face.log_likelihood(own_m, rates, other.rows)
-        # What was not seen can speak against an alternative, and not for one.
         nothing = face.nothing.ravel()[other.rows]
-        if more[nothing].sum() > 0:
-            more = np.where(nothing, 0.0, more)
-        nats = float(more.sum())
+        missed = np.bincount(square[other.rows[nothing]], more[nothing], count)
+        nats = float(more[~nothing].sum() + np.minimum(missed, MOST_MISSED).sum())
         if other.code not in best or nats > best[other.code].nats:
             best[other.code] = Gain(other.code, other.words, nats)
     return tuple(best.values())
@@ -135,7 +136,7 @@ def own_distance_m(rack: RackModel, grid: Grid) -> FloatArray:
 def _distances(rack: RackModel, grid: Grid) -> Iterator[tuple[str, str, FloatArray]]:
     outline_m, slots = _to_outline_m(rack, grid), rack.all_slots
     yield "no_openings", "a plate without openings", outline_m
-    for other in _lookalikes(rack):
+    for other in lookalikes(rack):
         for turned in (False, True):
             other_m = np.maximum(_to_outline_m(other, grid), _to_openings_m(other.all_slots, grid)).reshape(grid.shape)
             yield "other_rack", other.name, (other_m[::-1, ::-1] if turned else other_m).ravel()
@@ -162,7 +163,7 @@ def _distances(rack: RackModel, grid: Grid) -> Iterator[tuple[str, str, FloatArr
             yield f"{what}_fewer", f"a {what} of slots fewer at {side}", np.maximum(outline_m, without)
 
 
-def _lookalikes(rack: RackModel) -> tuple[RackModel, ...]:
+def lookalikes(rack: RackModel) -> tuple[RackModel, ...]:
     """Racks of the catalogue whose outline is nearly a rack's own."""
     racks = (item for item in catalogue().values() if isinstance(item, RackModel) and item.name != rack.name)
     return tuple(item for item in racks if np.abs(item.outline_m - rack.outline_m).max() < ALIKE_M)

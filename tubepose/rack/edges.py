@@ -16,19 +16,22 @@ from tubepose.labware import RackModel
 from tubepose.preprocessing import point_spacing_m, thin
 from tubepose.rack.agreement import outline_fits, rough_evidence
 from tubepose.rack.field import top_field
-from tubepose.rack.fit import RoughFit, filled, rack_frame
+from tubepose.rack.alternatives import lookalikes
+from tubepose.rack.fit import RoughFit, filled, rack_frame, top_frame
 from tubepose.rack.insufficient import outline_words, too_coarse
 from tubepose.rack.looks import on_lattice, seen_near
 from tubepose.rack.pose import MIN_POINTS, RackPose, RackStatus
 from tubepose.rack.search import Band, levels, search
-from tubepose.rack.settling import Registration, settled
+from tubepose.rack.settling import Registration, register_at, settled
 from tubepose.rack.turns import choose_turn, turns_of, unused_hint
-from tubepose.transforms import FloatArray
+from tubepose.transforms import FloatArray, translation
 
 # Places whose coarse picture agrees less than this, compared with one that was accepted, are no rivals of it.
 RIVAL_WORTH = 0.4
 # The fine rounds add no more than this to a pose's evidence.
 ROUGH_MARGIN = 1.05
+# Of a face of which so much is seen a rack that looks alike is told by its openings.
+MUCH_SEEN = 0.4
 # A rack that tubes in so many of its slots hold is nowhere else.
 CLEAR_TOPS = 0.6
 
@@ -42,7 +45,26 @@ def register_edges(
         return RackPose(RackStatus.INSUFFICIENT, few)
     few_m = coarse_sample(points_m, config.rack_top)
     best = best_registration(points_m, few_m, levels(few_m, config.rack_top), rack, config)
+    if best is not None and not best.reason:
+        best = _against_lookalikes(best, points_m, rack, config.rack)
     return pose_of(best, points_m, rack, config, hint, intrinsics)
+
+
+def _against_lookalikes(best: Registration, points_m: FloatArray, rack: RackModel, config: RackConfig) -> Registration:
+    """The same, refused where a rack of the catalogue with nearly its outline, registered there, is likelier.
+
+    Where much of a face is seen, that was told in the rack's own pose already.
+    """
+    if best.agreement.coverage >= MUCH_SEEN:
+        return best
+    checks = list(best.checks)
+    for other in lookalikes(rack):
+        T_camera_other = top_frame(best.fit.T_camera_rack, rack) @ translation([0, 0, -other.height_m])
+        there = register_at(points_m, T_camera_other, other, config)
+        gain = there.log_likelihood - best.log_likelihood
+        if not there.reason:
+            checks.append(Check("other_rack", gain, config.max_gain, gain <= config.max_gain, detail=other.name))
+    return replace(best, checks=tuple(checks))
 
 
 def pose_of(

@@ -55,8 +55,8 @@ class RackPose:
             its y axis, and what its corners have besides: b(x, y) = bow_x u^2 + bow_y v^2 + bow_xy u v, u = 2 x / length, v =
             2 y / width. None without a pose, and from a method that takes every face for flat.
         bow_std_m: Standard deviations of that, shape (3,).
-        named_by_margin: By how much the rack's agreement beats the next one's of the catalogue, where the rack was
-            named by that: 0 is no difference; NaN otherwise.
+        named_by_nats: By how much likelier the rack is than the next one of the catalogue that passes every check, where
+            it was named by that; infinity where no other passes, NaN where a person named it.
     """
 
     status: RackStatus
@@ -72,7 +72,7 @@ class RackPose:
     spacing_m: float = float("nan")
     covariance: FloatArray | None = None
     rack: RackModel | None = None
-    named_by_margin: float = float("nan")
+    named_by_nats: float = float("nan")
     hint_note: str = ""
     level_tops: int = 0
     checks: tuple[Check, ...] = ()

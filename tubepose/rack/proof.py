@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -10,7 +11,7 @@ from tubepose.checks import Check, failed
 from tubepose.config import RackConfig
 from tubepose.labware import RackModel
 from tubepose.rack.agreement import Agreement
-from tubepose.rack.alternatives import SIDES, edge_slots, gains, line_steps_m
+from tubepose.rack.alternatives import SIDES, edge_slots, gains, line_steps_m, own_distance_m
 from tubepose.rack.face import Face, face_grid, look_at_face
 from tubepose.rack.field import openings_field
 from tubepose.rack.fit import Fit, to_frame, top_frame
@@ -38,10 +39,26 @@ FLOOR_SLOTS = 3
 FLOOR_STD_M = 0.3e-3
 
 
-def prove(
-    points_m: FloatArray, fit: Fit, seen: Agreement, rack: RackModel, config: RackConfig
-) -> tuple[tuple[Check, ...], FaceSize | None, tuple[float, float] | None]:
-    """Every check of a registration, the sizes of its face, and its floor; without them where a quick look fails.
+@dataclass(frozen=True, slots=True, eq=False)
+class Proof:
+    """What became of a registration.
+
+    Attributes:
+        checks: Everything that it had to pass.
+        size: Sizes of its face; None where a quick look had failed.
+        floor_m: Height of the slots' floor above the rack's base and its standard deviation, metres; None where it was
+            not seen.
+        log_likelihood: Of the cells of its face and beside it, nats; minus infinity where a quick look had failed.
+    """
+
+    checks: tuple[Check, ...]
+    size: FaceSize | None = None
+    floor_m: tuple[float, float] | None = None
+    log_likelihood: float = float("-inf")
+
+
+def prove(points_m: FloatArray, fit: Fit, seen: Agreement, rack: RackModel, config: RackConfig) -> Proof:
+    """Every check of a registration, and what its face was measured to be; without that where a quick look fails.
 
     Args:
         points_m: Points near the rack, camera frame, shape (N, 3), metres; of a bowed rack those that were laid flat.
@@ -52,7 +69,7 @@ def prove(
     """
     checks = tuple(_quick(seen, fit, config))
     if failed(checks):
-        return checks, None, None
+        return Proof(checks)
     window_m = float(np.clip(FACE_SIGMAS * fit.scatter_m, *FACE_M))
     grid = face_grid(rack, seen.spacing_m, BESIDE_M)
     face = look_at_face(points_m, fit.T_camera_rack, rack, window_m, grid, seen.spacing_m)
@@ -66,7 +83,10 @@ def prove(
         *_sizes(size, rack, config),
     )
     floor_m = measure_floor(points_m, fit, rack)
-    return (*checks, *_scale(size, rack, distance_m, config), *_floor(floor_m, rack, config)), size, floor_m
+    checks += (*_scale(size, rack, distance_m, config), *_floor(floor_m, rack, config))
+    own_m = own_distance_m(rack, grid)
+    total = float(face.log_likelihood(own_m, face.rates(own_m), np.arange(own_m.size)).sum())
+    return Proof(checks, size, floor_m, total)
 
 
 def _quick(seen: Agreement, fit: Fit, config: RackConfig) -> Iterator[Check]:

@@ -35,6 +35,7 @@ class Registration:
         name: Of the rack.
         size: What the face's sizes are measured to be; None where a quick look had failed.
         floor_m: Height of the slots' floor and its standard deviation, metres; None where it was not seen.
+        log_likelihood: Of the cells of the face, nats; minus infinity where a quick look had failed.
     """
 
     fit: Fit
@@ -43,6 +44,7 @@ class Registration:
     name: str
     size: FaceSize | None = None
     floor_m: tuple[float, float] | None = None
+    log_likelihood: float = float("-inf")
 
     @property
     def reason(self) -> str:
@@ -118,5 +120,5 @@ def _refined(near_m: FloatArray, rough: RoughFit, rack: RackModel, config: RackC
     fit = refine(rough, rack)
     flat_m = fit.laid_flat(near_m, rack)
     agreement = measure_agreement(flat_m, fit, rack, config)
-    checks, size, floor_m = prove(flat_m, fit, agreement, rack, config)
-    return Registration(fit, agreement, checks, rack.name, size, floor_m)
+    proof = prove(flat_m, fit, agreement, rack, config)
+    return Registration(fit, agreement, proof.checks, rack.name, proof.size, proof.floor_m, proof.log_likelihood)
