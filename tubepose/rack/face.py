@@ -70,14 +70,14 @@ class Rates(NamedTuple):
     """What cells do besides showing what they are.
 
     Attributes:
-        hidden: How often nothing returns from a solid cell: away from what stands up, and beside it.
-        dark: How often nothing returns from an open one, likewise.
+        hidden: How often nothing returns from a solid cell, by the zones of `Face.zones`.
+        dark: How often nothing returns from an open one, likewise: wells are darker than what lies beside a rack.
         stray: How often an open cell looks solid.
         crossed: The same below what stands up: a tube's wall crosses the height of the face.
     """
 
-    hidden: tuple[float, float]
-    dark: tuple[float, float]
+    hidden: tuple[float, ...]
+    dark: tuple[float, ...]
     stray: float
     crossed: float
 
@@ -93,6 +93,7 @@ class Face:
         nothing: Cells, between others that have some, in which no line of sight ended at any height.
         standing: Cells above which something stands.
         shaded: Cells beside what stands up, where a projector leaves shadows.
+        beyond: Cells outside of the rack's outline.
         weight: How many independent observations one cell is.
     """
 
@@ -102,12 +103,18 @@ class Face:
     nothing: NDArray[np.bool_]
     standing: NDArray[np.bool_]
     shaded: NDArray[np.bool_]
+    beyond: NDArray[np.bool_]
     weight: float
 
     @cached_property
     def seen(self) -> NDArray[np.bool_]:
         """Cells that say solid or open."""
         return np.isfinite(self.solid)
+
+    @cached_property
+    def zones(self) -> NDArray[np.uint8]:
+        """Zone of every cell, shape (X, Y): 1 more where it is shaded, 2 more where it is beyond the outline."""
+        return np.asarray(self.shaded + 2 * self.beyond, np.uint8)
 
     def log_likelihood(self, distance_m: FloatArray, rates: Rates, rows: NDArray[np.intp]) -> FloatArray:
         """Log likelihood of some cells, shape (K,), nats.
@@ -121,7 +128,7 @@ class Face:
             rows: The cells that count, indices into the flattened grid.
         """
         found = view_kernels.cell_logs(
-            self.solid.ravel(), self.nothing.ravel(), self.standing.ravel(), self.shaded.ravel(), distance_m[rows],
+            self.solid.ravel(), self.nothing.ravel(), self.standing.ravel(), self.zones.ravel(), distance_m[rows],
             rows, rates.hidden, rates.dark, rates.stray, rates.crossed, WRONG_SHARE, EDGE_SHIFT_M, BLUR_M,
         )  # fmt: skip
         return np.asarray(self.weight * found)
@@ -134,18 +141,18 @@ class Face:
         """
         distance_m = distance_m.reshape(self.grid.shape)
         solid, opened = distance_m < -INSIDE_M, distance_m > OPEN_M
+        zones = [self.zones == zone for zone in range(4)]
         hidden, dark = (
-            [
-                _rate(self.nothing & cells & zone, self.seen & cells & zone, NOTHING)
-                for zone in (~self.shaded, self.shaded)
-            ]
+            [_rate(self.nothing & cells & zone, self.seen & cells & zone, NOTHING) for zone in zones]
             for cells in (solid, opened)
         )
+        # Hardly a cell of a rack is solid beyond its outline: those within it tell.
+        hidden[2:] = hidden[:2]
         clear, below = opened & self.seen & ~self.standing, opened & self.seen & self.standing
         at = np.nan_to_num(self.solid) > 0.5
         stray, crossed = (_rate(cells & at, cells & ~at, WRONG_SHARE) for cells in (clear, below))
         stray = min(stray, MOST_STRAY)
-        return Rates((min(hidden[0], dark[0]), min(hidden[1], dark[1])), (dark[0], dark[1]), stray, max(crossed, stray))
+        return Rates(tuple(map(min, hidden, dark)), tuple(dark), stray, max(crossed, stray))
 
 
 def _rate(some: NDArray[np.bool_], others: NDArray[np.bool_], expected: float) -> float:
@@ -179,8 +186,9 @@ def look_at_face(
     empty = (told + above + other) == 0
     nothing, shaded = empty & _surrounded(~empty), _beside(above > told, grid.cell_m)
     independent = min(1.0, (max(grid.cell_m, spacing_m) / INDEPENDENT_M) ** 2)
+    beyond = np.any(np.abs(grid.centers_m) > rack.outline_m / 2, axis=-1)
     places = np.where(clear[..., None], sums.transpose(1, 2, 0) / np.maximum(told, 1)[..., None], grid.centers_m)
-    return Face(grid, places, solid, nothing, _footprint(standing > 0, grid.cell_m), shaded, independent)
+    return Face(grid, places, solid, nothing, _footprint(standing > 0, grid.cell_m), shaded, beyond, independent)
 
 
 def _footprint(standing: NDArray[np.bool_], cell_m: float) -> NDArray[np.bool_]:

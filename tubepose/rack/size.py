@@ -104,7 +104,7 @@ def measure_size(face: Face, rack: RackModel) -> FaceSize:
     xy, inner, outline = face.grid.centers_m, openings_field(rack), outline_field(rack)
     own_m = own_distance_m(rack, face.grid)
     rates = face.rates(own_m)
-    missed = np.where(face.seen, 0.0, np.take(rates.hidden, face.shaded.astype(np.intp)))
+    missed = np.where(face.seen, 0.0, np.take(rates.hidden, face.zones))
     told = face.seen | (face.nothing & ~_patchy(face, own_m))
     near = told & np.all(np.abs(xy) < rack.outline_m / 2 + REACH_M, axis=-1)
     if rates.hidden[1] > MOST_HIDDEN:

@@ -203,11 +203,11 @@ def crossed(points_m, step, rotation, origin_m, camera_m):
 
 
 @compiled
-def cell_logs(solid, nothing, standing, shaded, part_m, rows, hidden, dark, stray, crossed, wrong, shift_m, blur_m):
+def cell_logs(solid, nothing, standing, zones, part_m, rows, hidden, dark, stray, crossed, wrong, shift_m, blur_m):
     """Log likelihoods (K,) of some cells `rows` (K,), each at a distance from the solid part, (K,); see `Face`.
 
     `solid` is the share of points at the face's height, NaN without any; `hidden` and `dark` are rates of cells without
-    a return away from what stands up and beside it, (2,) each.
+    a return by their zone, (4,) each.
     """
     found = np.zeros(len(rows))
     for k in range(len(rows)):
@@ -218,7 +218,7 @@ def cell_logs(solid, nothing, standing, shaded, part_m, rows, hidden, dark, stra
             continue
         eta = (shift_m - part_m[k]) / blur_m
         s = 1.0 / (1.0 + math.exp(-min(max(eta, -30.0), 30.0)))
-        zone = 1 if shaded[row] else 0
+        zone = zones[row]
         none = s * hidden[zone] + (1.0 - s) * dark[zone]
         if not seen:
             found[k] = math.log(none)
