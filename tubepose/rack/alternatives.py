@@ -15,7 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tubepose.labware import RackModel, SlotModel, catalogue
-from tubepose.rack.face import Face, Grid
+from tubepose.rack import view_kernels as view_kernels
+from tubepose.rack.face import Face, Grid, solid_levels
 from tubepose.transforms import FloatArray
 
 # Fields that differ by less than this everywhere in a cell are the same there.
@@ -40,14 +41,14 @@ class Alternative:
     Attributes:
         code: What kind of difference it is.
         words: What it is, to be read after "the scan shows".
-        distance_m: Signed distance of every cell's centre from its solid part, shape (X * Y,), metres.
-        rows: Cells in which it differs, indices.
+        rows: Cells in which it differs, indices, shape (K,).
+        levels: Their chance of being solid, `solid_levels`, shape (K,).
     """
 
     code: str
     words: str
-    distance_m: FloatArray
     rows: NDArray[np.intp]
+    levels: NDArray[np.uint8]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -73,15 +74,12 @@ def gains(face: Face, rack: RackModel) -> tuple[Gain, ...]:
         rack: The rack.
     """
     own_m = own_distance_m(rack, face.grid)
-    rates = face.rates(own_m)
-    square, count = squares(face.grid)
-    best: dict[str, Gain] = {}
+    tables, (square, count) = face.tables(face.rates(own_m)), squares(face.grid)
+    own, best = _own_levels(rack, _key(face.grid)), dict[str, Gain]()
     for other in alternatives(rack, face.grid):
-        more = face.log_likelihood(other.distance_m, rates, other.rows)
-        more -= face.log_likelihood(own_m, rates, other.rows)
-        nothing = face.nothing.ravel()[other.rows]
-        missed = np.bincount(square[other.rows[nothing]], more[nothing], count)
-        nats = float(more[~nothing].sum() + np.minimum(missed, MOST_MISSED).sum())
+        missed = np.zeros(count)
+        seen = view_kernels.gained(face.kinds, face.shares, other.rows, other.levels, own, *tables, square, missed)
+        nats = float(seen + np.minimum(missed, MOST_MISSED).sum())
         if other.code not in best or nats > best[other.code].nats:
             best[other.code] = Gain(other.code, other.words, nats)
     return tuple(best.values())
@@ -109,7 +107,7 @@ def _cached(rack: RackModel, key: tuple[float, ...]) -> tuple[Alternative, ...]:
     found = []
     for code, words, distance_m in _distances(rack, grid):
         rows = np.flatnonzero(np.abs(distance_m - own_m) > SAME_M)
-        found.append(Alternative(code, words, distance_m, rows))
+        found.append(Alternative(code, words, rows, solid_levels(distance_m[rows])))
     return tuple(found)
 
 
@@ -126,6 +124,11 @@ def _key(grid: Grid) -> tuple[float, ...]:
 def _own(rack: RackModel, key: tuple[float, ...]) -> FloatArray:
     grid = Grid(np.array(key[:2]), key[2], (int(key[3]), int(key[4])))
     return np.maximum(_to_outline_m(rack, grid), _to_openings_m(rack.all_slots, grid))
+
+
+@lru_cache(maxsize=64)
+def _own_levels(rack: RackModel, key: tuple[float, ...]) -> NDArray[np.uint8]:
+    return solid_levels(_own(rack, key))
 
 
 def own_distance_m(rack: RackModel, grid: Grid) -> FloatArray:

@@ -15,14 +15,14 @@ from tubepose.config import Config, RackConfig, RackTopConfig
 from tubepose.labware import RackModel
 from tubepose.preprocessing import point_spacing_m, thin
 from tubepose.rack.agreement import outline_fits, rough_evidence
-from tubepose.rack.field import top_field
 from tubepose.rack.alternatives import lookalikes
+from tubepose.rack.field import top_field
 from tubepose.rack.fit import RoughFit, filled, rack_frame, top_frame
 from tubepose.rack.insufficient import outline_words, too_coarse
 from tubepose.rack.looks import on_lattice, seen_near
 from tubepose.rack.pose import MIN_POINTS, RackPose, RackStatus
 from tubepose.rack.search import Band, levels, search
-from tubepose.rack.settling import Registration, register_at, settled
+from tubepose.rack.settling import Registration, likelihood_at, settled
 from tubepose.rack.turns import choose_turn, turns_of, unused_hint
 from tubepose.transforms import FloatArray, translation
 
@@ -60,9 +60,8 @@ def _against_lookalikes(best: Registration, points_m: FloatArray, rack: RackMode
     checks = list(best.checks)
     for other in lookalikes(rack):
         T_camera_other = top_frame(best.fit.T_camera_rack, rack) @ translation([0, 0, -other.height_m])
-        there = register_at(points_m, T_camera_other, other, config)
-        gain = there.log_likelihood - best.log_likelihood
-        if not there.reason:
+        gain = likelihood_at(points_m, T_camera_other, other, config) - best.log_likelihood
+        if np.isfinite(gain):
             checks.append(Check("other_rack", gain, config.max_gain, gain <= config.max_gain, detail=other.name))
     return replace(best, checks=tuple(checks))
 

@@ -13,6 +13,7 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import expit
 
 from tubepose.labware import RackModel
 from tubepose.rack import view_kernels as view_kernels
@@ -30,6 +31,8 @@ SEEN_BELOW_M = 1.5e-3
 SHADOW_M = 20e-3
 # Blur of an edge: a pixel may be half on either side.
 BLUR_M = 0.4e-3
+# Steps that chances are counted in.
+LEVELS = 256
 # Points nearer than this share their label's error: they count as one.
 INDEPENDENT_M = 1.5e-3
 # A cell this far from every edge tells how often nothing returns from solid parts (ribs are 1 mm wide) and open ones.
@@ -64,6 +67,11 @@ def face_grid(rack: RackModel, spacing_m: float, beyond_m: float) -> Grid:
     cell_m = max(CELL_M, steps * CELL_STEP_M)
     half = np.ceil((rack.outline_m / 2 + beyond_m) / cell_m).astype(int)
     return Grid(-half * cell_m, float(cell_m), (int(2 * half[0] + 1), int(2 * half[1] + 1)))
+
+
+def solid_levels(distance_m: FloatArray) -> NDArray[np.uint8]:
+    """Chance of cells to be solid, logistic((shift - d) / blur), in `LEVELS` steps; d (K,) their distance, metres."""
+    return np.asarray(np.rint((LEVELS - 1) * expit((EDGE_SHIFT_M - distance_m) / BLUR_M)), np.uint8)
 
 
 class Rates(NamedTuple):
@@ -116,22 +124,39 @@ class Face:
         """Zone of every cell, shape (X, Y): 1 more where it is shaded, 2 more where it is beyond the outline."""
         return np.asarray(self.shaded + 2 * self.beyond, np.uint8)
 
-    def log_likelihood(self, distance_m: FloatArray, rates: Rates, rows: NDArray[np.intp]) -> FloatArray:
-        """Log likelihood of some cells, shape (K,), nats.
+    @cached_property
+    def kinds(self) -> NDArray[np.uint8]:
+        """What every cell is, shape (X * Y,): its zone, 4 more below what stands up, 8 for nothing; 16 for no news."""
+        kinds = np.where(self.seen, self.zones + 4 * self.standing, np.where(self.nothing, 8 + self.zones, 16))
+        return np.asarray(kinds.ravel(), np.uint8)
 
-        A cell at signed distance d from the solid part is solid with s = logistic((shift - d) / blur), returns nothing
-        with the rate of what it is, and otherwise shows what it is, but for a share of wrong ones.
+    @cached_property
+    def shares(self) -> FloatArray:
+        """`solid`, 0 where nothing was seen, shape (X * Y,)."""
+        return np.nan_to_num(self.solid).ravel()
+
+    def tables(self, rates: Rates) -> tuple[FloatArray, FloatArray]:
+        """Log likelihoods of cells by their kind and their chance of being solid, nats; see `view_kernels.gained`.
+
+        A cell that is solid with the chance s returns nothing with the rate of what it is, and otherwise shows what it
+        is, but for a share of wrong ones.
+        """
+        s = np.arange(LEVELS) / (LEVELS - 1)
+        none = np.array(rates.hidden)[:, None] * s + np.array(rates.dark)[:, None] * (1 - s)
+        seen = []
+        for wrong in (rates.stray, rates.crossed):
+            shown = wrong + (1 - WRONG_SHARE - wrong) * s
+            seen.append(np.log1p(-none)[:, None] + np.log(np.stack([shown, 1 - shown])))
+        return self.weight * np.concatenate(seen), self.weight * np.log(none)
+
+    def log_likelihood(self, distance_m: FloatArray) -> float:
+        """Log likelihood of all cells with a hypothesis, nats.
 
         Args:
-            distance_m: Signed distance of every cell's centre, negative in the solid, shape (X * Y,), metres.
-            rates: What else cells do.
-            rows: The cells that count, indices into the flattened grid.
+            distance_m: Signed distance of every cell's centre from its solid part, shape (X * Y,), metres.
         """
-        found = view_kernels.cell_logs(
-            self.solid.ravel(), self.nothing.ravel(), self.standing.ravel(), self.zones.ravel(), distance_m[rows],
-            rows, rates.hidden, rates.dark, rates.stray, rates.crossed, WRONG_SHARE, EDGE_SHIFT_M, BLUR_M,
-        )  # fmt: skip
-        return np.asarray(self.weight * found)
+        tables = self.tables(self.rates(distance_m))
+        return float(view_kernels.whole(self.kinds, self.shares, solid_levels(distance_m), *tables))
 
     def rates(self, distance_m: FloatArray) -> Rates:
         """What cells do besides showing what they are, by those of a hypothesis (X * Y,), 2 to 90 %.

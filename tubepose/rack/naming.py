@@ -51,9 +51,9 @@ def name_rack(
 ) -> tuple[RackPose, tuple[RankedRack, ...]]:
     """Find out which rack stands there, and its pose (always by method ``edges``).
 
-    A rack is named if it passes every check of `register_rack`, and is likelier than the next rack that passes them too by
-    `rack.max_gain` nats. `RackPose.rack` is the rack, `named_by_nats` by how much it is likelier: infinity where no other
-    passes.
+    A rack is named if it passes every check of `register_rack`, and is likelier than the next rack that passes them too
+    by `rack.max_gain` nats. `RackPose.rack` is the rack, `named_by_nats` by how much it is likelier: infinity where no
+    other passes.
 
     Args:
         points_m: Array of shape (N, 3), camera frame, metres, without NaN: the rack's box or the whole frame.
@@ -96,8 +96,8 @@ def _not_named(ranking: Sequence[RankedRack], known: int, config: Config) -> str
         return ""
     told = ", ".join(entry.rack.name for entry in ranking[:TOLD])
     return (
-        f"more than one rack fits: {told}, the first one likelier by {ahead:.0f} nats, at least {config.rack.max_gain:g} "
-        "expected: name it"
+        f"more than one rack fits: {told}, the first one likelier by {ahead:.0f} nats, at least "
+        f"{config.rack.max_gain:g} expected: name it"
     )
 
 

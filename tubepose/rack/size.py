@@ -21,7 +21,7 @@ from tubepose.rack.tops_in_slots import TopsInSlots
 from tubepose.transforms import FloatArray
 
 # Blurs of the rounds, and how many rounds each has: the first reaches over the width of a rib.
-BLURS_M = np.array([1.5e-3, 0.8e-3, 0.4e-3])
+BLURS_M = np.array([1.2e-3, 0.4e-3])
 ROUNDS = 3
 # What the unknowns may be, standard deviations, and how far one step of the scoring goes.
 PRIOR_STD = np.array([5e-3, 0.7e-3, 0.7e-3, 0.03, 0.03, 1.5e-3, 1.5e-3, 1.5e-3])
