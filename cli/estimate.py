@@ -88,7 +88,7 @@ def estimate(
 ) -> None:
     """Estimate the pose of the rack and of every tube in recorded captures.
 
-    Writes racks.csv, sensor.csv, slots.csv, estimates.csv, timings.csv, run.json and overlays/ into --out.
+    Writes racks, sensor, slots, estimates, checks, labware_check and timings.csv, run.json and overlays/ into --out.
     """
     from tubepose.capture.session import SESSION_FILE, is_session
     from tubepose.config import load_config

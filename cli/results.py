@@ -11,6 +11,7 @@ if TYPE_CHECKING:
     from tubepose.config import Config
     from tubepose.labware import Labware
     from tubepose.pipeline import Scene, TubeEstimate
+    from tubepose.records import Row
 
 
 JUDGED_FILES = (
@@ -39,9 +40,10 @@ def run_estimates(
     problems: Sequence[str] = (),
     **more: Any,
 ) -> Tables:
-    """Run jobs and write their four tables, sensor.csv, run.json and overlays/ into `out`, and say how noisy they are.
+    """Run jobs, write their tables, run.json and overlays/ into `out`, and say how noisy they are and what contradicts.
 
-    The tables are racks.csv, slots.csv, estimates.csv and timings.csv. `problems` are those from before, and `labware`
+    The tables are racks, sensor, slots, estimates, checks, labware_check and timings.csv.
+    `problems` are those from before, and `labware`
     what was used besides, for the record. `JUDGED_FILES` of an earlier run are removed.
 
     Raises:
@@ -49,10 +51,10 @@ def run_estimates(
     """
     from tubepose.batch import Tables, run_jobs
     from tubepose.errors import StoppedError
+    from tubepose.labware_check import pooled_rows
     from tubepose.provenance import inputs_sha256, pinned_threads, run_record
-    from tubepose.records import ESTIMATE_COLUMNS, RACK_COLUMNS, SENSOR_COLUMNS, SLOT_COLUMNS, TIMING_COLUMNS, to_table
-    from tubepose.report.writing import make_folder, remove_files, write_csv, write_json
-    from tubepose_cli.show import describe_noise, progress, say, say_when_compiling
+    from tubepose.report.writing import make_folder, remove_files, write_json
+    from tubepose_cli.show import describe_noise, describe_sizes, progress, say, say_when_compiling
 
     taken: dict[str, tuple[str, ...]] = {}
 
@@ -75,11 +77,8 @@ def run_estimates(
         if not tables.done:
             raise StoppedError(f"{stopped}; no estimate is written to {out}") from None
     remove_files(out, JUDGED_FILES)
-    write_csv(out / "racks.csv", to_table(tables.racks, RACK_COLUMNS))
-    write_csv(out / "sensor.csv", to_table(tables.sensor, SENSOR_COLUMNS))
-    write_csv(out / "slots.csv", to_table(tables.slots, SLOT_COLUMNS))
-    write_csv(out / "estimates.csv", to_table(tables.estimates, ESTIMATE_COLUMNS))
-    write_csv(out / "timings.csv", to_table(tables.timings, TIMING_COLUMNS))
+    sizes = pooled_rows(tables.labware_check)
+    _write_tables(tables, sizes, out)
     record = run_record(
         command,
         config,
@@ -94,9 +93,28 @@ def run_estimates(
     write_json(out / "run.json", record)
     if tables.sensor:
         say(describe_noise(tables.sensor))
+    for line in describe_sizes(sizes):
+        say(line)
     if stopped:
         raise StoppedError(f"{stopped}, and in the tables in {out}")
     return tables
+
+
+def _write_tables(tables: Tables, sizes: Sequence[Row], out: Path) -> None:
+    """Every table of a run; `sizes` are the rows of labware_check.csv for the run as a whole."""
+    from tubepose import records
+    from tubepose.report.writing import write_csv
+
+    for name, rows, columns in (
+        ("racks", tables.racks, records.RACK_COLUMNS),
+        ("sensor", tables.sensor, records.SENSOR_COLUMNS),
+        ("slots", tables.slots, records.SLOT_COLUMNS),
+        ("estimates", tables.estimates, records.ESTIMATE_COLUMNS),
+        ("checks", tables.checks, records.CHECK_COLUMNS),
+        ("labware_check", [*tables.labware_check, *sizes], records.LABWARE_COLUMNS),
+        ("timings", tables.timings, records.TIMING_COLUMNS),
+    ):
+        write_csv(out / f"{name}.csv", records.to_table(rows, columns))
 
 
 def overlay_name(job: Job, scene: Scene, taken: dict[str, tuple[str, ...]]) -> str:

@@ -100,6 +100,34 @@ def describe_noise(rows: Sequence[Mapping[str, Any]]) -> str:
     return "; ".join([f"{text} ({where}), edges {middle('edge_blur_px', edges):.1f} px{assumed}", *notes[:1]])
 
 
+def describe_sizes(rows: Sequence[Mapping[str, Any]]) -> list[str]:
+    """A line for each size that contradicts its file, from the rows of labware_check.csv over the run."""
+    things = {
+        "pitch_x_mm": "slots {} mm apart along x",
+        "pitch_y_mm": "slots {} mm apart along y",
+        "opening_mm": "openings of {} mm",
+        "outline_x_mm": "an outline of {} mm along x",
+        "outline_y_mm": "an outline of {} mm along y",
+        "floor_mm": "the floor of the slots {} mm above the rack's base",
+        "scale": "everything {} times as large",
+        "top_height_mm": "caps {} mm high",
+        "cap_diameter_mm": "caps {} mm wide",
+    }
+    return [_size_line(row, things[str(row["quantity"])]) for row in rows if row["contradicts"]]
+
+
+def _size_line(row: Mapping[str, Any], thing: str) -> str:
+    digits = {"scale": 4, "pitch_x_mm": 2, "pitch_y_mm": 2}.get(str(row["quantity"]), 1)
+    of_tubes = row["quantity"] in ("top_height_mm", "cap_diameter_mm")
+    counted = f"{row['n']} {'tube' if of_tubes else 'frame'}{'s' if row['n'] > 1 else ''}"
+    seen = thing.format(f"{row['measured']:.{digits}f}") + f" ({counted}, +-{row['std']:.{digits}f})"
+    other = {"": "", "another type": ", or it is another type"}.get(row["other_key"], f", or {row['other_key']}")
+    do = f"correct {row['key']} to {row['write']:.{digits}f}{other}"
+    if row["quantity"] == "scale":
+        do = f"multiply {row['key']} by {row['write']:.{digits}f}{other}"
+    return f"labware: the scan shows {seen}, {row['labware']} says {row['defined']:g}: {do}"
+
+
 def say_when_compiling() -> None:
     """One line before loops are compiled: it takes a while, and the machine code is kept."""
     from tubepose.compiled import before_compiling
@@ -128,8 +156,10 @@ def describe_tubes(estimates: Sequence[Mapping[str, Any]]) -> str:
     """How many tubes of a frame are ok, rejected and failed, and the commonest reason."""
     counts = Counter(str(row["status"]) for row in estimates)
     words = [f"{counts['ok']} tubes ok", *(f"{counts[name]} {name}" for name in ("rejected", "failed") if counts[name])]
-    reasons = Counter(str(row["reason"]) for row in estimates if row["reason"])
-    why = f" ({reasons.most_common(1)[0][0]})" if reasons else ""
+    why, codes = "", Counter(str(row["reason_code"]) for row in estimates if row["reason"])
+    if codes:
+        commonest = codes.most_common(1)[0][0]
+        why = f" ({next(row['reason'] for row in estimates if row['reason'] and row['reason_code'] == commonest)})"
     return ", ".join(words) + why
 
 

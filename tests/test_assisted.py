@@ -172,9 +172,9 @@ def test_what_is_seen_of_a_tube_narrows_its_types_down():
     for tube in closed:
         assert identify_tube(CAPPED_CLASS, points(tube), TUBES, RACK, CONFIG.slots)[0] == tube
     # As high as an open one, but seen to be capped.
-    found, reason = identify_tube(CAPPED_CLASS, points(opened[0]), TUBES, RACK, CONFIG.slots)
+    found, why = identify_tube(CAPPED_CLASS, points(opened[0]), TUBES, RACK, CONFIG.slots)
     assert found != opened[0]
-    assert found is not None or "unknown type" in reason
+    assert found is not None or why.code == "unknown_type"
     # A cap is easily taken for an opening: with no open type at hand, height decides alone.
     assert identify_tube(OPEN_CLASS, points(closed[0]), closed[:1], RACK, CONFIG.slots)[0] == closed[0]
 

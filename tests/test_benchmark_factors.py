@@ -136,7 +136,7 @@ def test_wrong_and_beyond_targets_are_counted(factors: ModuleType) -> None:
         {"outcome": "false"},
     ]
     errors = pd.DataFrame(rows).reindex(columns=ERROR_COLUMNS)
-    errors = errors.assign(method="profile", tube=TUBE, score=0.5, type_correct=None)
+    errors = errors.assign(method="profile", tube=TUBE, confidence=0.5, type_correct=None)
     (row,) = factors.table_rows(errors, {TUBE: False})
     assert (row["ok"], row["expected"], row["rejected"], row["missed"], row["false"]) == (3, 5, 1, 1, 1)
     assert row["wrong"] == 2

@@ -777,7 +777,10 @@ def test_boxes_from_elsewhere_give_the_same_slots(
 
 
 def test_what_became_of_the_tubes_is_said_with_the_commonest_reason() -> None:
-    rows = [{"status": "ok", "reason": ""}, *({"status": "rejected", "reason": "too tall"} for _ in range(2))]
+    rows = [
+        {"status": "ok", "reason": "", "reason_code": ""},
+        *({"status": "rejected", "reason": "too tall", "reason_code": "tall"} for _ in range(2)),
+    ]
     assert describe_tubes(rows) == "1 tubes ok, 2 rejected (too tall)"
     assert describe_tubes([]) == "0 tubes ok"
 

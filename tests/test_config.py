@@ -68,7 +68,7 @@ def test_a_section_cannot_be_changed_in_place():
 @pytest.mark.parametrize(
     ("text", "words"),
     [
-        ("profile: {score_tilt_rad: 0}", "score_tilt_rad: Input should be greater than 0"),
+        ("profile: {slope_std: 0}", "slope_std: Input should be greater than 0"),
         ("rack: {min_seen: .nan}", "min_seen: .*finite"),
         ("rack: {max_inlier_rmse_m: -1}", "max_inlier_rmse_m: expected 0 or more, found -1"),
         ("rack: {icp_distances_m: []}", "icp_distances_m: expected one or more numbers, all more than 0"),

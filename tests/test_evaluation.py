@@ -155,14 +155,14 @@ def truth_row(trial, slot, tube="chen2023-tube-1", status="ok", T=CAMERA):
 
 
 def estimate_row(
-    trial, slot, method="paper", T=CAMERA, tube="chen2023-tube-1", status="ok", seed=pd.NA, score=1.0, frame=0
+    trial, slot, method="paper", T=CAMERA, tube="chen2023-tube-1", status="ok", seed=pd.NA, confidence=1.0, frame=0
 ):
     at = pose(T) if T is not None else dict.fromkeys(pose(CAMERA), np.nan)
     return {
         "session": "s", "trial": trial, "capture": f"{trial}-original", "frame": frame,
         "timestamp_ns": 1_700_000_000_000_000_001, "method": method, "seed": seed, "slot": slot, "tube": tube,
-        "status": status, "reason": "", "score": score, **at, "tilt_deg": 0.0, "inlier_rmse_m": 0.0, "fitness": 1.0,
-        "n_points": 100,
+        "status": status, "reason": "", "confidence": confidence, **at, "tilt_deg": 0.0, "inlier_rmse_m": 0.0,
+        "fitness": 1.0, "n_points": 100,
     }  # fmt: skip
 
 
@@ -278,11 +278,11 @@ def test_no_estimates_at_all_are_missed_tubes():
     assert errors["seed"].isna().all()
 
 
-def test_the_second_accepted_estimate_in_a_slot_is_false_and_the_better_score_counts():
+def test_the_second_accepted_estimate_in_a_slot_is_false_and_the_higher_confidence_counts():
     rows = [
-        estimate_row("a", "A1", T=CAMERA @ turned(x_deg=5.0), score=0.2),
-        estimate_row("a", "A1", T=CAMERA @ turned(x_deg=1.0), score=0.9),
-        estimate_row("a", "A1", T=CAMERA @ turned(x_deg=0.0), score=0.99, status="rejected"),
+        estimate_row("a", "A1", T=CAMERA @ turned(x_deg=5.0), confidence=0.2),
+        estimate_row("a", "A1", T=CAMERA @ turned(x_deg=1.0), confidence=0.9),
+        estimate_row("a", "A1", T=CAMERA @ turned(x_deg=0.0), confidence=0.99, status="rejected"),
     ]
     errors = evaluate(table(rows), TRUTH, TUBES, ["paper"])
     here = errors[errors["slot"] == "A1"]

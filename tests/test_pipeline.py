@@ -10,6 +10,7 @@ import pytest
 import scenes
 
 from tubepose.capture.hints import SlotHint
+from tubepose.checks import said
 from tubepose.config import Config
 from tubepose.detection import Detection
 from tubepose.detection.geometric import GeometricDetector
@@ -88,7 +89,7 @@ def test_slots_and_kinds_of_all_tubes_are_found(scene):
     assert scene.rack_pose.status is RackStatus.OK
     assert scene.rack_pose.resolved_by == "hint"
     assert {target.slot: target.tube for target in scene.targets} == {slot: tube for slot, (tube, _) in PLACED.items()}
-    assert all(target.reason == "" for target in scene.targets)
+    assert all(target.why is None for target in scene.targets)
 
 
 def test_the_paper_recovers_the_poses_in_both_frames(scene):
@@ -173,7 +174,7 @@ def test_without_a_rack_nothing_is_invented():
     frame = frame_of()
     found = prepare(frame, detector=Fixed((Detection("tube", 1.0, (0.0, 0.0, 9.0, 9.0), "recorded"),)))
     assert found.rack_pose.status is RackStatus.NOT_FOUND
-    assert found.rack_pose.reason == "the detector found no rack"
+    assert found.rack_pose.reason_code == "no_detection"
     assert found.targets == ()
     assert estimate_tubes(found, "paper", CONFIG) == ((), ())
     assert [time.stage for time in found.times] == ["detect", "rack"]
@@ -216,7 +217,7 @@ def test_a_target_that_no_method_can_be_asked_is_rejected_with_its_reason():
     for method in TUBE_METHODS:
         (estimate,), times = estimate_tubes(found, method, CONFIG, 0)
         assert estimate.pose.status is TubeStatus.REJECTED
-        assert "lies across the rack?" in estimate.pose.reason
+        assert estimate.pose.reason_code == "in_no_slot"
         assert estimate.pose.T_rack_tube is None
         assert estimate.T_camera_tube is None
         assert times == ()
@@ -226,16 +227,16 @@ def test_without_tube_models_the_slots_are_known_and_the_reason_names_the_option
     capped = {slot: PLACED[slot] for slot in ("C5", "E10")}
     found = prepare(frame_of(capped), tubes=(), hint=hint_for(T_CAMERA_RACK))
     assert {target.slot for target in found.targets} == set(capped)
-    assert {(target.tube, target.reason) for target in found.targets} == {(None, "no tube model given (--tubes)")}
+    assert {(target.tube, target.why.code) for target in found.targets} == {(None, "no_types_given")}
 
 
 def test_an_unknown_kind_keeps_its_slot_and_says_why():
     found = prepare(frame_of({"C5": PLACED["C5"]}), tubes=TUBES[2:], hint=hint_for(T_CAMERA_RACK))
     (target,) = found.targets
     assert (target.slot, target.tube) == ("C5", None)
-    assert "unknown type: " in target.reason
+    assert target.why.code == "unknown_type"
     (estimate,), _ = estimate_tubes(found, "paper", CONFIG)
-    assert (estimate.pose.status, estimate.pose.reason) == (TubeStatus.REJECTED, target.reason)
+    assert (estimate.pose.status, estimate.pose.reason_code) == (TubeStatus.REJECTED, "unknown_type")
 
 
 def test_points_in_the_box_that_no_such_tube_can_own_do_not_reach_the_fit():
@@ -272,7 +273,7 @@ def test_profile_needs_neither_boxes_nor_the_slots_of_others(seen):
     assert [time.stage for time in seen.times] == ["detect", "sensor", "slots"]
     estimates, times = estimate_tubes(seen, "profile", CONFIG)
     assert {e.target.slot: e.target.tube for e in estimates} == {slot: tube for slot, (tube, _) in PLACED.items()}
-    assert {(e.method, e.seed, e.target.detection, e.target.reason) for e in estimates} == {("profile", None, None, "")}
+    assert {(e.method, e.seed, e.target.detection, e.target.why) for e in estimates} == {("profile", None, None, None)}
     assert [time.instance for time in times] == [estimate.target.slot for estimate in estimates]
     assert len({time.duration_ms for time in times}) == 1
     for estimate in estimates:
@@ -320,8 +321,8 @@ def test_a_tube_across_the_rack_is_no_target_of_profile_but_a_row_with_a_reason(
     )
     (estimate,), (time,) = estimate_tubes(found, "profile", CONFIG)
     assert (estimate.target.slot, estimate.target.tube, estimate.T_camera_tube) == (None, None, None)
-    assert estimate.target.reason == estimate.pose.reason
-    assert estimate.pose.reason.startswith("lies across the rack: ")
+    assert estimate.target.why == estimate.pose.checks[0]
+    assert estimate.pose.reason_code == "lies_across"
     assert time.instance == ""
     rows = {row["slot"]: row for row in slot_rows({}, "profile", found, (estimate,))}
     # Nothing can be put into the slots under it.
@@ -340,7 +341,7 @@ def test_a_slot_with_two_finds_has_one_row_and_it_is_the_first(seen):
     first = estimates[0]
     second = dataclasses.replace(
         first,
-        target=dataclasses.replace(first.target, tube=None, reason="a second top"),
+        target=dataclasses.replace(first.target, tube=None, why=said("second_top", "a second top")),
         pose=dataclasses.replace(first.pose, status=TubeStatus.REJECTED, reason="a second top", T_rack_tube=None),
     )
     rows = slot_rows({}, "profile", seen, (*estimates, second))

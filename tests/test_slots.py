@@ -89,7 +89,7 @@ def test_every_tube_gets_its_own_slot_and_the_others_stay_empty():
     assigned = assign_slots(tubes, RACK, CONFIG)
     assert [entry.slot for entry in assigned] == held
     assert [entry.detection for entry in assigned] == [0, 1, 2, 3]
-    assert all(entry.reason == "" and entry.share > 0.8 for entry in assigned)
+    assert all(entry.why is None and entry.share > 0.8 for entry in assigned)
     assert all(np.all(entry.points_m[:, 2] > RACK.height_m + CONFIG.clearance_m) for entry in assigned)
 
 
@@ -100,9 +100,9 @@ def test_no_tubes_no_slots():
 def test_two_tubes_on_one_slot_the_larger_share_keeps_it():
     shifted, centred = disc(center_mm("B3", off=(1.5, 0)), 8.0), disc(center_mm("B3"), 8.0)
     loser, winner = assign_slots([shifted, centred], RACK, CONFIG)
-    assert (winner.slot, winner.reason) == ("B3", "")
+    assert (winner.slot, winner.why) == ("B3", None)
     assert loser.slot is None
-    assert loser.reason == "slot B3 holds another tube"
+    assert (loser.why.code, loser.why.detail) == ("slot_taken", "B3")
     assert 0.5 < loser.share < winner.share
 
 
@@ -110,7 +110,7 @@ def test_the_one_that_must_go_takes_its_next_best_free_slot():
     centred, between = disc(center_mm("B3"), 8.0), disc(center_mm("B3", off=(8.0, 0)), 8.0)
     winner, other = assign_slots([centred, between], RACK, CONFIG)
     assert winner.slot == "B3"
-    assert (other.slot, other.reason) == ("B4", "")
+    assert (other.slot, other.why) == ("B4", None)
     assert other.share == pytest.approx(slot_shares(between, RACK)[NAMES.index("B4")])
 
 
@@ -125,14 +125,14 @@ def test_a_tube_that_lies_across_the_rack_has_no_slot():
     lying = np.random.default_rng(0).uniform([-50, -8, 60], [50, 8, 70], (500, 3)) * 1e-3
     (entry,) = assign_slots([lying], RACK, CONFIG)
     assert entry.slot is None
-    assert "lies across the rack?" in entry.reason
-    assert f"{entry.share:.0%}" in entry.reason
+    assert entry.why.code == "in_no_slot"
+    assert entry.why.value == pytest.approx(100 * entry.share)
     assert 0 < entry.share < CONFIG.min_share
 
 
 def test_a_box_without_points_above_the_top_says_so():
     (entry,) = assign_slots([scenes.rack_top(RACK)], RACK, CONFIG)
-    assert (entry.slot, entry.reason, len(entry.points_m)) == (None, "no points above the rack's top", 0)
+    assert (entry.slot, entry.why.code, len(entry.points_m)) == (None, "no_points_above", 0)
 
 
 def test_reach_of_the_axis_by_hand():
@@ -158,28 +158,30 @@ def test_crop_keeps_the_tube_at_its_largest_lean_and_drops_the_neighbour():
 def test_the_height_tells_the_kind(tube):
     above = np.array([0.0, 0.2, np.sqrt(0.96)])
     points = scenes.tube_surface(tube, scenes.tube_pose(RACK, "B2"), RACK.height_m, seen_from=above)
-    assert identify_tube("tube", points, (TUBE_3, TUBE_2, TUBE_1), RACK, CONFIG) == (tube, "")
+    assert identify_tube("tube", points, (TUBE_3, TUBE_2, TUBE_1), RACK, CONFIG) == (tube, None)
 
 
 def test_a_class_name_outweighs_the_height():
     points = scenes.tube_surface(TUBE_3, scenes.tube_pose(RACK, "B2"), RACK.height_m)
     candidates = (TUBE_1, TUBE_2, TUBE_3)
-    assert identify_tube("purple-cap", points, candidates, RACK, CONFIG) == (TUBE_2, "")
-    assert identify_tube(TUBE_1.name, points, candidates, RACK, CONFIG) == (TUBE_1, "")
+    assert identify_tube("purple-cap", points, candidates, RACK, CONFIG) == (TUBE_2, None)
+    assert identify_tube(TUBE_1.name, points, candidates, RACK, CONFIG) == (TUBE_1, None)
 
 
 def test_an_unknown_class_names_the_known_ones():
-    tube, reason = identify_tube("vial", np.zeros((30, 3)), (TUBE_2, TUBE_3), RACK, CONFIG)
+    tube, why = identify_tube("vial", np.zeros((30, 3)), (TUBE_2, TUBE_3), RACK, CONFIG)
     assert tube is None
-    assert "'vial' belongs to none" in reason
-    assert "chen2023-tube-2, chen2023-tube-3, purple-cap, tube-2, tube-3, white-cap" in reason
+    assert why.code == "unknown_class"
+    assert "'vial' belongs to none" in why.detail
+    assert "chen2023-tube-2, chen2023-tube-3, purple-cap, tube-2, tube-3, white-cap" in why.detail
 
 
 def test_an_unknown_height_is_told_with_the_expected_ones():
     points = disc(center_mm("A1"), 8.0, z_mm=RACK.floor_mm + 90.0)
-    tube, reason = identify_tube("tube", points, (TUBE_2, TUBE_3), RACK, CONFIG)
+    tube, why = identify_tube("tube", points, (TUBE_2, TUBE_3), RACK, CONFIG)
     assert tube is None
-    assert reason == "unknown type: 90.0 mm high, expected (mm): chen2023-tube-2 100, chen2023-tube-3 105.5"
+    assert why.code == "unknown_type"
+    assert why.detail.endswith("90.0 mm high, expected (mm): chen2023-tube-2 100, chen2023-tube-3 105.5")
 
 
 def test_an_open_rim_may_seem_lower_than_it_is_and_a_cap_may_not():
@@ -194,6 +196,7 @@ def test_an_open_rim_may_seem_lower_than_it_is_and_a_cap_may_not():
 
 def test_heights_that_are_alike_are_not_guessed():
     points = disc(center_mm("A1"), 8.0, z_mm=RACK.floor_mm + 106.5)  # 1.0 from one, 1.25 from the other
-    tube, reason = identify_tube("tube", points, (TUBE_1, TUBE_2, TUBE_3), RACK, CONFIG)
+    tube, why = identify_tube("tube", points, (TUBE_1, TUBE_2, TUBE_3), RACK, CONFIG)
     assert tube is None
-    assert reason == "106.5 mm high: chen2023-tube-3 and chen2023-tube-1 are not told apart by height"
+    assert (why.code, why.detail) == ("types_alike", "chen2023-tube-3 and chen2023-tube-1")
+    assert why.value == pytest.approx(106.5)

@@ -4,10 +4,11 @@ import numpy as np
 import pytest
 import scenes
 
+from tubepose.checks import failed, sentence
 from tubepose.config import Config, TubeConfig
 from tubepose.labware import load_rack, load_tube
 from tubepose.transforms import tilt_rad, tilt_rotation
-from tubepose.tube import _COSTS, TubeStatus, axis_distance_m, clearance_m, fit_cylinder, fit_tube, rejection
+from tubepose.tube import _COSTS, TubeStatus, axis_distance_m, clearance_m, fit_cylinder, fit_tube, wall_checks
 
 CONFIG = Config()
 RACK = load_rack("chen2023-soft-5x10")
@@ -176,10 +177,12 @@ def test_rejection_names_the_axis_and_has_the_allowance_of_the_floor_play(sign, 
     for factor in (0.99, 1.01):
         angles = [0.0, 0.0]
         angles[at] = sign * limit * factor
-        reason = rejection(*angles, SLOT, TUBE_2, RACK, CONFIG)
-        assert bool(reason) == (factor > 1)
-    assert f"along the rack's {axis}" in reason
-    assert f"leans {np.rad2deg(limit) * 1.01:.2f} deg" in reason
+        wrong = failed(wall_checks(*angles, SLOT, TUBE_2, RACK, CONFIG))
+        assert [check.code for check in wrong] == ["in_wall"] * (factor > 1)
+    words = sentence(wrong[0], TUBE_2.name)
+    assert f"along the rack's {axis}" in words
+    assert f"leans {np.rad2deg(limit) * 1.01:.2f} deg" in words
+    assert wrong[0].value > 0
 
 
 def test_a_slot_that_is_wider_along_x_allows_more_there():
@@ -190,18 +193,19 @@ def test_a_slot_that_is_wider_along_x_allows_more_there():
     radius_m = float(TUBE_3.body_radius_m(hard.depth_m))
     narrow, wide = (limit_tilt_rad(half + allowance_m, hard.depth_m, radius_m) for half in slot.half_size_m)
     between = (narrow + wide) / 2
-    assert "rack's x" in rejection(0.0, between, slot, TUBE_3, hard, CONFIG)
-    assert rejection(between, 0.0, slot, TUBE_3, hard, CONFIG) == ""
+    assert [check.passed for check in wall_checks(0.0, between, slot, TUBE_3, hard, CONFIG)] == [False, True]
+    assert [check.passed for check in wall_checks(between, 0.0, slot, TUBE_3, hard, CONFIG)] == [True, True]
 
 
 def test_a_cap_wider_than_its_slot_is_no_reason_to_reject():
     assert TUBE_3.max_radius_m > SLOT.half_size_m[0] + 1e-3
-    assert rejection(0.0, 0.0, SLOT, TUBE_3, RACK, CONFIG) == ""
+    assert failed(wall_checks(0.0, 0.0, SLOT, TUBE_3, RACK, CONFIG)) == ()
 
 
 def test_a_tube_that_leans_more_than_its_slot_allows_is_rejected_with_its_pose():
     pose = fit_tube(seen(TUBE_3, 0.0, 3.5, ABOVE), SLOT, TUBE_3, RACK, CONFIG)
     assert pose.status is TubeStatus.REJECTED
+    assert pose.reason_code == "in_wall"
     assert "along the rack's x" in pose.reason
     assert pose.T_rack_tube is not None
 
@@ -212,7 +216,8 @@ def test_fewer_points_than_the_least_are_rejected_without_a_pose(count):
     assert pose.status is TubeStatus.REJECTED
     assert pose.T_rack_tube is None
     assert pose.n_points == count
-    assert pose.reason == f"{count} points above the rack's top, at least 25 expected"
+    assert pose.reason_code == "few_points"
+    assert [(check.value, check.limit) for check in pose.checks] == [(count, 25)]
 
 
 def test_points_of_something_else_lower_the_fitness():

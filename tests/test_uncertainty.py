@@ -108,14 +108,15 @@ def test_columns_are_named_by_what_they_hold() -> None:
 
 
 def rows(
-    method: str, tube: str, squares: list[float], tilts: list[float], scores: list[float], outcome: str = "ok"
+    method: str, tube: str, squares: list[float], tilts: list[float], sure: list[float], outcome: str = "ok"
 ) -> Any:
     return pd.DataFrame(
         {
             "method": method,
             "tube": tube,
             "outcome": outcome,
-            "score": scores,
+            "confidence": sure,
+            "right": pd.array([tilt <= 0.5 for tilt in tilts], dtype="boolean"),
             "tilt_deg": tilts,
             "mahalanobis2": squares,
         }
@@ -127,7 +128,7 @@ ERRORS = pd.concat(
         rows("profile", "b", [1.0, 5.0, 20.0, 4.0], [0.1, 0.2, 0.9, 0.4], [0.9, 0.7, 0.1, 0.5]),
         rows("profile", "a", [2.0], [0.3], [0.6]),
         rows("profile", "a", [99.0], [5.0], [0.99], outcome="rejected"),
-        rows("paper", "a", [np.nan, np.nan], [0.5, 0.7], [0.2, 0.8]),
+        rows("paper", "a", [np.nan, np.nan], [0.5, 0.7], [np.nan, np.nan]),
     ],
     ignore_index=True,
 )
@@ -141,6 +142,8 @@ def test_honesty_by_hand() -> None:
     assert of_b["n"] == 4
     assert of_b["inside_95"] == 0.75  # 20 is above 11.07
     assert of_b["mahalanobis2_mean"] == 7.5
+    assert of_b["confidence_mean"] == pytest.approx(0.55)
+    assert of_b["right_share"] == 0.75  # the tilt of 0.9 deg is wrong here
     assert of_b["tilt_deg_all"] == pytest.approx(0.4)
     assert of_b["tilt_deg_best_half"] == pytest.approx(0.15)
     assert of_b["tilt_deg_worst_half"] == pytest.approx(0.65)
@@ -161,11 +164,11 @@ def test_coverage_by_hand() -> None:
     assert list(found) == list(COVERAGE_COLUMNS)
     of_b = found[(found["method"] == "profile") & (found["tube"] == "b")]
     assert of_b["coverage"].tolist() == [1.0, 0.75, 0.5, 0.25]
-    assert of_b["score"].tolist() == [0.1, 0.5, 0.7, 0.9]
+    assert of_b["confidence"].tolist() == [0.1, 0.5, 0.7, 0.9]
     assert of_b["tilt_deg_mean"].tolist() == pytest.approx([0.4, 0.7 / 3, 0.15, 0.1])
     assert of_b["tilt_deg_max"].tolist() == [0.9, 0.4, 0.2, 0.1]
-    # A method without covariances has scores all the same.
-    assert set(found.loc[found["method"] == "paper", "tube"]) == {"a", "all"}
+    # A method that states no covariance has no confidence either.
+    assert set(found["method"]) == {"profile"}
 
 
 @pytest.mark.parametrize("make", [uncertainty, coverage])

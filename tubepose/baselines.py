@@ -12,11 +12,12 @@ from functools import lru_cache
 import numpy as np
 import open3d as o3d
 
+from tubepose.checks import said
 from tubepose.config import Config, IcpConfig
 from tubepose.labware import RackModel, SlotModel, TubeModel
 from tubepose.preprocessing import to_o3d
 from tubepose.transforms import FloatArray, axis_rotation, invert_transform, make_transform, translation
-from tubepose.tube import TubePose, TubeStatus
+from tubepose.tube import TubePose, TubeStatus, refused
 
 registration = o3d.pipelines.registration
 Feature = o3d.pipelines.registration.Feature
@@ -30,7 +31,7 @@ def fit_upright(
     """The trivial answer: bottom at the slot's centre, axis along the rack's normal. It looks at no point."""
     del config, seed, tube
     T_rack_tube = translation(rack.bottom_center_m(slot))
-    return TubePose(TubeStatus.OK, "", T_rack_tube, score=1.0, n_points=len(points_m))
+    return TubePose(TubeStatus.OK, "", T_rack_tube, n_points=len(points_m))
 
 
 def fit_slot_icp(
@@ -79,7 +80,7 @@ def fit_global_icp(
 
 def failed(reason: str, points_m: FloatArray) -> TubePose:
     """No pose, and why."""
-    return TubePose(TubeStatus.FAILED, reason, n_points=len(points_m))
+    return refused(said("no_pose", reason), n_points=len(points_m), status=TubeStatus.FAILED)
 
 
 def refine(
@@ -110,7 +111,7 @@ def refine(
         T_tube_rack, fitness, rmse = result.transformation, float(result.fitness), float(result.inlier_rmse)
     T = invert_transform(T_tube_rack)
     T_fixed_spin = make_transform(axis_rotation(T[:3, 2]), T[:3, 3])
-    return TubePose(TubeStatus.OK, "", T_fixed_spin, fitness, rmse, fitness, len(points_m))
+    return TubePose(TubeStatus.OK, "", T_fixed_spin, inlier_rmse_m=rmse, fitness=fitness, n_points=len(points_m))
 
 
 @lru_cache(maxsize=32)

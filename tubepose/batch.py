@@ -20,10 +20,11 @@ from tubepose.config import Config
 from tubepose.detection import Detector
 from tubepose.errors import CaptureError, TubePoseError, is_interrupt, kept
 from tubepose.labware import Labware, RackModel, TubeModel
+from tubepose.labware_check import compare_sizes, refuse_by_tops, size_row
 from tubepose.pipeline import DEFAULT_METHOD, STOCHASTIC, Scene, StageTime, TubeEstimate, estimate_tubes, prepare_scene
 from tubepose.rack import RackPose, RackStatus
 from tubepose.rack.turns import EarlierTurns
-from tubepose.records import Row, estimate_row, rack_pose_row, rack_row, sensor_row, slot_rows, timing_row
+from tubepose.records import Row, check_rows, estimate_row, rack_pose_row, rack_row, sensor_row, slot_rows, timing_row
 from tubepose.transforms import FloatArray
 
 DetectorFactory = Callable[[RackModel, tuple[TubeModel, ...]], Detector]
@@ -99,6 +100,8 @@ class Tables:
         slots: One per frame, method and slot.
         estimates: One per frame, method, seed and detected tube.
         timings: One per timed stage instance.
+        checks: One per check of a rack or of a tube, frame and method.
+        labware_check: One per frame and size that it shows of a rack or of a type of tube.
         labware: Every rack and tube that was looked for, by name.
         problems: One line per capture that could not be finished.
         done: How many captures were finished or failed: all of them, but where the user stops the batch.
@@ -109,6 +112,8 @@ class Tables:
     slots: list[Row] = field(default_factory=list)
     estimates: list[Row] = field(default_factory=list)
     timings: list[Row] = field(default_factory=list)
+    checks: list[Row] = field(default_factory=list)
+    labware_check: list[Row] = field(default_factory=list)
     labware: dict[str, Labware] = field(default_factory=dict)
     problems: list[str] = field(default_factory=list)
     done: int = 0
@@ -123,7 +128,7 @@ class Tables:
             del rows[length:]
 
     def _rows(self) -> tuple[list[Row], ...]:
-        return self.racks, self.sensor, self.slots, self.estimates, self.timings
+        return self.racks, self.sensor, self.slots, self.estimates, self.timings, self.checks, self.labware_check
 
 
 def session_jobs(session: Session, *, fail_fast: bool = False) -> tuple[list[Job], list[str]]:
@@ -312,20 +317,27 @@ def _run_frame(
     times = ([load] if load is not None else []) + list(scene.times)
     shown_method = DEFAULT_METHOD if DEFAULT_METHOD in methods else methods[0]
     shown: tuple[TubeEstimate, ...] = ()
+    shown_scene = scene
     for method in methods:
         for seed in range(seeds) if method in STOCHASTIC else (None,):
             estimates, tube_times = estimate_tubes(scene, method, config, seed)
             times += tube_times
-            tables.estimates += [estimate_row(keys, scene, estimate) for estimate in estimates]
+            judged = scene
+            if method == DEFAULT_METHOD:
+                judged, estimates = refuse_by_tops(scene, estimates, config)
+            tables.estimates += [estimate_row(keys, judged, estimate) for estimate in estimates]
             if method == shown_method and seed in (None, 0):
-                shown = estimates
+                shown, shown_scene = estimates, judged
             if seed in (None, 0):
-                tables.racks.append({**keys, "method": method, **rack_row(scene), "named_by_nats": job.named_by_nats})
-                tables.slots += slot_rows(keys, method, scene, estimates)
+                tables.racks.append({**keys, "method": method, **rack_row(judged), "named_by_nats": job.named_by_nats})
+                tables.slots += slot_rows(keys, method, judged, estimates)
+                tables.checks += check_rows(keys, method, judged, estimates)
+    of_profile = shown if shown_method == DEFAULT_METHOD else ()
+    tables.labware_check += [{**keys, **size_row(size)} for size in compare_sizes(shown_scene, of_profile, config)]
     timings = tables.timings if warm_timings is None else warm_timings
     timings += [timing_row(keys, entry, warm_timings is not None) for entry in times]
     if on_scene is not None:
-        on_scene(job, scene, shown)
+        on_scene(job, shown_scene, shown)
     if scene.rack_pose.status is RackStatus.UNIT and warm_timings is None:
         raise CaptureError(scene.rack_pose.reason)
     return scene.rack_pose

@@ -294,7 +294,6 @@ class ProfileConfig(_Section):
         max_runner_up: A type whose top another one fits with this share of its support is not told apart.
         max_height_error_m: A closed top farther off its height than this is rejected.
         max_tilt_std_rad: A tilt that is not known better than this is rejected.
-        score_tilt_rad: Standard deviation of the tilt at which the score is a half.
         widening_m: Standard deviation of a circle's apparent radius, and of how elliptic it looks.
     """
 
@@ -331,7 +330,6 @@ class ProfileConfig(_Section):
     max_height_error_m: float = 1.2e-3
     max_runner_up: float = 0.9
     max_tilt_std_rad: float = 0.0105
-    score_tilt_rad: float = Field(default=0.0035, gt=0)
 
 
 class IcpConfig(_Section):

@@ -12,6 +12,7 @@ import numpy as np
 import pandas as pd
 from scipy.spatial.transform import Rotation
 
+from tubepose.confidence import within
 from tubepose.labware import TubeModel
 from tubepose.pose_errors import (
     COVARIANCE_COLUMNS,
@@ -31,7 +32,7 @@ AXES = ("rx_deg", "ry_deg", "tilt_deg", "tx_mm", "ty_mm", "tz_mm")
 ERROR_VALUES = (*AXES, "lateral_mm", "axial_mm", "cap_mm", "mssd_mm", "add_s_mm")
 ERROR_COLUMNS = (
     "session", "trial", "capture", "method", "seed", "slot", "tube", "outcome", "reason",
-    "tube_estimated", "type_correct", "score", *ERROR_VALUES, "mahalanobis2",
+    "tube_estimated", "type_correct", "confidence", "right", *ERROR_VALUES, "mahalanobis2",
 )  # fmt: skip
 COMPARISON_COLUMNS = (
     "method", "reference", "tube", "error", "mean_difference", "ci95_low", "ci95_high", "n_pairs", "n_captures",
@@ -53,7 +54,8 @@ def evaluate(
     """Judge every expected tube for every method and seed, and list accepted estimates that nothing was expected for.
 
     Expected are the slots whose truth is ok. A trial is judged on its first frame, whatever was found in it. Where
-    several estimates claim one slot, an accepted one goes before a rejected one, then the higher score; accepted ones
+    several estimates claim one slot, an accepted one goes before a rejected one, then the higher confidence; accepted
+    ones
     that are left over are false. Slots whose truth was refused are neither expected nor false; trials without truth
     are left out.
 
@@ -72,10 +74,11 @@ def evaluate(
         ``missed`` (no estimate), ``failed`` (no pose, or upside down) or ``false``; errors as in `PoseErrors`.
     """
     # Tables from before covariances were stated, and methods that state none.
-    estimates = estimates.assign(**{name: np.nan for name in COVARIANCE_COLUMNS if name not in estimates})
+    stated = ("confidence", *COVARIANCE_COLUMNS)
+    estimates = estimates.assign(**{name: np.nan for name in stated if name not in estimates})
     judged = _judged(estimates, truth, methods, estimates if racks is None else racks)
     best = judged[judged["slot"].notna() & ~judged.duplicated(_MATCH)]
-    columns = [*_MATCH, "tube", "status", "reason", "score", *_POSE, *COVARIANCE_COLUMNS]
+    columns = [*_MATCH, "tube", "status", "reason", "confidence", *_POSE, *COVARIANCE_COLUMNS]
     rows = _expected(estimates, truth, judged, methods, seeds or {}).merge(
         best[columns], how="left", on=_MATCH, suffixes=("", "_estimated"), validate="one_to_one"
     )
@@ -83,6 +86,7 @@ def evaluate(
         (rows["tube_estimated"] == rows["tube"]).astype("boolean").mask(rows["tube_estimated"].isna())
     )
     rows = rows.assign(**_errors(rows, tube_models))
+    rows["right"] = _right(rows)
     rows["outcome"], rows["reason"] = _outcomes(rows)
     table = pd.concat([_shape(rows), _shape(_false_rows(judged, truth))], ignore_index=True)
     rank = table["method"].map({method: i for i, method in enumerate(methods)})
@@ -99,7 +103,7 @@ def _judged(estimates: pd.DataFrame, truth: pd.DataFrame, methods: Sequence[str]
     first = frames.groupby(_TRIAL, as_index=False)["frame"].min()
     rows = rows.merge(first, on=[*_TRIAL, "frame"])
     rows = rows.assign(seed_key=_seed_key(rows), rank=rows["status"].map(_RANK))
-    return rows.sort_values(["rank", "score"], ascending=[True, False], kind="stable").drop(columns="rank")
+    return rows.sort_values(["rank", "confidence"], ascending=[True, False], kind="stable").drop(columns="rank")
 
 
 def _seed_key(rows: pd.DataFrame) -> pd.Series[int]:
@@ -154,6 +158,15 @@ def _errors(rows: pd.DataFrame, tube_models: Mapping[str, TubeModel]) -> dict[st
     return values
 
 
+def _right(rows: pd.DataFrame) -> pd.Series[bool]:
+    """Whether poses are right as `tubepose.confidence` has it, and of the right type; NA without a pose."""
+    std_along_m = np.sqrt(rows["cov_tz_tz"].to_numpy(dtype=float))
+    errors = [rows[name].to_numpy(dtype=float) for name in ("tilt_deg", "lateral_mm", "axial_mm")]
+    right = within(np.deg2rad(errors[0]), 1e-3 * errors[1], 1e-3 * errors[2], std_along_m)
+    right &= rows["type_correct"].fillna(False).to_numpy(dtype=bool)
+    return pd.Series(right, index=rows.index).astype("boolean").mask(np.isnan(errors[0]))
+
+
 def _covariances(rows: pd.DataFrame) -> FloatArray:
     """Covariances (N, 5, 5) from the columns of their upper half."""
     covariance = np.empty((len(rows), 5, 5))
@@ -184,7 +197,7 @@ def _false_rows(judged: pd.DataFrame, truth: pd.DataFrame) -> pd.DataFrame:
     rows = rows[(rows["status"] == "ok") & (empty | (rows["second"] & (rows["truth_status"] == "ok")))]
     reasons = np.where(rows["truth_status"].notna(), "slot is taken", "slot holds no tube")
     reasons = np.where(rows["slot"].isna(), "stands in no slot", reasons)
-    rows = rows.assign(outcome="false", reason=reasons, tube_estimated=rows["tube"], type_correct=None)
+    rows = rows.assign(outcome="false", reason=reasons, tube_estimated=rows["tube"], type_correct=None, right=None)
     return rows.assign(**dict.fromkeys((*ERROR_VALUES, "mahalanobis2"), np.nan)).sort_values(
         [*_TRIAL, "method", "seed_key", "slot"]
     )
@@ -197,9 +210,9 @@ def _shape(rows: pd.DataFrame) -> pd.DataFrame:
     texts = ["session", "trial", "capture", "method", "slot", "tube", "outcome", "reason", "tube_estimated"]
     types: dict[str, Any] = {
         **dict.fromkeys(texts, "str"),
-        **dict.fromkeys(("score", *ERROR_VALUES, "mahalanobis2"), "float64"),
+        **dict.fromkeys(("confidence", *ERROR_VALUES, "mahalanobis2"), "float64"),
     }
-    return table.astype({**types, "seed": "Int64", "type_correct": "boolean"})
+    return table.astype({**types, "seed": "Int64", "type_correct": "boolean", "right": "boolean"})
 
 
 def summarise(errors: pd.DataFrame, methods: Sequence[str] | None = None) -> pd.DataFrame:

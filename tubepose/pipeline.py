@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import TypeGuard
 
 from tubepose.baselines import fit_global_icp, fit_slot_icp, fit_upright
 from tubepose.capture.frame import CameraIntrinsics, RgbdFrame
 from tubepose.capture.hints import TurnHint
 from tubepose.capture.registration import known_intrinsics, refuse_mirrored
+from tubepose.checks import failed
 from tubepose.config import Config
 from tubepose.detection import Detection, Detector, points_in_box
 from tubepose.detection.assisted import AssistedDetector
@@ -24,7 +26,7 @@ from tubepose.slots import SlotLook, look_at_slots
 from tubepose.stage_times import Clock, StageTime
 from tubepose.targets import allowed_types, boxes_alone, find_targets
 from tubepose.transforms import FloatArray
-from tubepose.tube import TubeMethod, TubePose, TubeStatus, fit_tube
+from tubepose.tube import TubeMethod, TubePose, fit_tube, refused
 
 TUBE_METHODS: Mapping[str, TubeMethod] = {
     "paper": fit_tube,
@@ -121,7 +123,7 @@ def estimate_tubes(
     estimates = []
     for target in scene.targets:
         if target.slot is None or target.tube is None:
-            pose = TubePose(TubeStatus.REJECTED, target.reason, n_points=len(target.points_m))
+            pose = _not_asked(target)
         else:
             slot = scene.rack.slot(target.slot)
             with clock.stage("tube", method, target.slot, seed):
@@ -157,7 +159,7 @@ def _profile_estimates(scene: Scene, config: Config) -> tuple[tuple[TubeEstimate
     )
     share_ms = (time.perf_counter_ns() - start) / 1e6 / max(len(found), 1)
     targets = [(_profile_target(tube), tube.pose) for tube in found]
-    targets += [(other, TubePose(TubeStatus.REJECTED, other.reason)) for other in boxes_alone(scene, found, config)]
+    targets += [(other, replace(_not_asked(other), n_points=0)) for other in boxes_alone(scene, found, config)]
     estimates = tuple(_estimate(scene, DEFAULT_METHOD, None, *target) for target in targets)
     times = tuple(StageTime("tube", DEFAULT_METHOD, tube.slot or "", None, share_ms) for tube in found)
     return estimates, times
@@ -168,8 +170,14 @@ def _bow(pose: RackPose) -> FaceBow | None:
 
 
 def _profile_target(tube: ProfileTube) -> TubeTarget:
-    reason = "" if tube.tube is not None else tube.pose.reason
-    return TubeTarget(None, tube.slot, tube.tube, tube.support, reason, tube.points_m)
+    why = next(iter(failed(tube.pose.checks)), None) if tube.tube is None else None
+    return TubeTarget(None, tube.slot, tube.tube, tube.support, why, tube.points_m)
+
+
+def _not_asked(target: TubeTarget) -> TubePose:
+    """The answer of every method for a target without a slot or a type."""
+    assert target.why is not None
+    return refused(target.why, n_points=len(target.points_m))
 
 
 def best_rack(detections: Sequence[Detection]) -> Detection | None:
@@ -188,7 +196,7 @@ def _rack_pose(
 ) -> RackPose:
     best = best_rack(detections)
     if best is None:
-        return RackPose(RackStatus.NOT_FOUND, "the detector found no rack")
+        return RackPose(RackStatus.NOT_FOUND, "the detector found no rack", code="no_detection")
     return register_rack(points_in_box(frame, best, RACK_MARGIN), rack, config, hint, intrinsics)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import asdict
 from typing import Any
 
 import numpy as np
@@ -10,6 +11,7 @@ import pandas as pd
 from scipy.spatial.transform import Rotation
 
 from tubepose.capture.frame import RgbdFrame
+from tubepose.checks import Check, mark_codes
 from tubepose.occupancy import held_slots, stated_slots
 from tubepose.pipeline import Scene, StageTime, TubeEstimate, best_rack
 from tubepose.pose_errors import COVARIANCE_COLUMNS, upper_half
@@ -24,7 +26,8 @@ RACK_COVARIANCE_AXES = ("rx", "ry", "rz", "tx", "ty", "tz")
 """Order of a rack's covariance: small turns about its axes and shifts along them, at the centre of its top."""
 RACK_COVARIANCE_COLUMNS = upper_half(RACK_COVARIANCE_AXES)
 RACK_COLUMNS = (
-    "session", "trial", "capture", "frame", "timestamp_ns", "method", "rack", "status", "reason", "ambiguous",
+    "session", "trial", "capture", "frame", "timestamp_ns", "method", "rack", "status", "reason", "reason_code",
+    "marks", "ambiguous",
     "resolved_by", "hint_note", "turn_margin_m", "inlier_rmse_m", "fitness", "in_slot_share", "coverage", "spacing_m",
     "level_tops", "n_racks_detected", "n_tubes_detected", "box_source", "box_score", "box_note", *POSE_COLUMNS,
     "named_by_nats", *RACK_COVARIANCE_COLUMNS,
@@ -53,10 +56,13 @@ SLOT_COLUMNS = (
     "n_points",
     "status",
     "reason",
+    "reason_code",
+    "rack_marks",
 )
 ESTIMATE_COLUMNS = (
     "session", "trial", "capture", "frame", "timestamp_ns", "method", "seed", "slot", "tube", "ambiguous", "status",
-    "reason", "score", *POSE_COLUMNS, "tilt_deg", "inlier_rmse_m", "fitness", "n_points", *COVARIANCE_COLUMNS,
+    "reason", "reason_code", "rack_marks", "confidence",
+    *POSE_COLUMNS, "tilt_deg", "inlier_rmse_m", "fitness", "n_points", *COVARIANCE_COLUMNS,
 )  # fmt: skip
 TIMING_COLUMNS = (
     "session",
@@ -70,13 +76,22 @@ TIMING_COLUMNS = (
     "duration_ms",
     "warmup",
 )
+CHECK_COLUMNS = (
+    "session", "trial", "capture", "frame", "method", "subject", "slot", "code", "value", "limit", "passed", "decides",
+    "detail",
+)  # fmt: skip
+LABWARE_COLUMNS = (
+    "session", "trial", "capture", "frame", "quantity", "labware", "key", "defined", "measured", "std", "n",
+    "tolerance", "contradicts", "write", "other_key",
+)  # fmt: skip
 _WHOLE = ("timestamp_ns", "seed", "n_racks_detected", "n_tubes_detected")
 
 
 def to_table(rows: Sequence[Row], columns: Sequence[str]) -> pd.DataFrame:
     """Rows as a table with exactly these columns; stamps and seeds stay whole numbers (Int64)."""
     table = pd.DataFrame(list(rows), columns=list(columns))
-    for name in set(_WHOLE) & set(columns):  # not by way of floats, which hold no nanoseconds
+    whole = {*_WHOLE, *(("frame",) if any(row.get("frame") is None for row in rows) else ())}
+    for name in whole & set(columns):  # not by way of floats, which hold no nanoseconds
         table[name] = pd.array([row.get(name) for row in rows], dtype="Int64")
     return table
 
@@ -120,6 +135,8 @@ def rack_pose_row(frame: RgbdFrame, pose: RackPose) -> Row:
         "timestamp_ns": frame.timestamp_ns,
         "status": pose.status.value,
         "reason": pose.reason,
+        "reason_code": pose.reason_code,
+        "marks": mark_codes(pose.checks),
         "ambiguous": pose.ambiguous,
         "resolved_by": pose.resolved_by,
         "hint_note": pose.hint_note,
@@ -162,6 +179,7 @@ def slot_rows(keys: Row, method: str, scene: Scene, estimates: Sequence[TubeEsti
             "method": method,
             "slot": name,
             "ambiguous": scene.rack_pose.ambiguous,
+            "rack_marks": mark_codes(scene.rack_pose.checks),
             **said,
             "n_points": 0,
         }
@@ -173,6 +191,7 @@ def slot_rows(keys: Row, method: str, scene: Scene, estimates: Sequence[TubeEsti
                 "n_points": len(target.points_m),
                 "status": estimate.pose.status.value,
                 "reason": estimate.pose.reason,
+                "reason_code": estimate.pose.reason_code,
             }
         rows.append(row)
     return rows
@@ -194,7 +213,9 @@ def estimate_row(keys: Row, scene: Scene, estimate: TubeEstimate) -> Row:
         "ambiguous": scene.rack_pose.ambiguous,
         "status": pose.status.value,
         "reason": pose.reason,
-        "score": pose.score,
+        "reason_code": pose.reason_code,
+        "rack_marks": mark_codes(scene.rack_pose.checks),
+        "confidence": pose.confidence,
         **pose_columns(estimate.T_camera_tube),
         "tilt_deg": tilt_deg,
         "inlier_rmse_m": pose.inlier_rmse_m,
@@ -202,6 +223,13 @@ def estimate_row(keys: Row, scene: Scene, estimate: TubeEstimate) -> Row:
         "n_points": pose.n_points,
         **covariance_columns(pose.covariance),
     }
+
+
+def check_rows(keys: Row, method: str, scene: Scene, estimates: Sequence[TubeEstimate]) -> list[Row]:
+    """Rows of checks.csv: every check of the rack, then those of a method's tubes."""
+    found: list[tuple[str, str | None, Check]] = [("rack", None, check) for check in scene.rack_pose.checks]
+    found += [("tube", e.target.slot, check) for e in estimates for check in e.pose.checks]
+    return [{**keys, "method": method, "subject": of, "slot": slot, **asdict(check)} for of, slot, check in found]
 
 
 def covariance_columns(covariance: FloatArray | None, columns: Sequence[str] = COVARIANCE_COLUMNS) -> Row:

@@ -244,7 +244,7 @@ def _refine_gicp(
     fitness, rmse_m = len(near) / len(points_m), float(np.sqrt(np.mean(near**2)))
     T = invert_transform(T_tube_rack)
     T_fixed_spin = make_transform(axis_rotation(T[:3, 2]), T[:3, 3])
-    return TubePose(TubeStatus.OK, "", T_fixed_spin, fitness, rmse_m, fitness, len(points_m))
+    return TubePose(TubeStatus.OK, "", T_fixed_spin, inlier_rmse_m=rmse_m, fitness=fitness, n_points=len(points_m))
 
 
 def _prepared(points_m: FloatArray, neighbors: int) -> tuple[Any, Any]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from tubepose.capture.frame import CameraIntrinsics, RgbdFrame
+from tubepose.checks import Check
 from tubepose.detection import Detection
 from tubepose.labware import RackModel, TubeModel
 from tubepose.rack import RackPose
@@ -24,7 +25,7 @@ class TubeTarget:
         slot: Name of the slot, or None.
         tube: The tube's model, or None where its type is unknown.
         share: Share of its projected hull in the slot's opening; of `profile`, how much of its top was seen.
-        reason: Why no method can be asked; empty otherwise.
+        why: Why no method can be asked; None where one can.
         points_m: Points, rack frame, shape (N, 3), metres.
     """
 
@@ -32,7 +33,7 @@ class TubeTarget:
     slot: str | None
     tube: TubeModel | None
     share: float
-    reason: str
+    why: Check | None
     points_m: FloatArray
 
 

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tubepose.capture.frame import RgbdFrame
+from tubepose.checks import said
 from tubepose.config import Config
 from tubepose.detection import Detection, points_in_box
 from tubepose.detection.assisted import SURE_SCORE
@@ -40,14 +41,14 @@ def _target(
 ) -> TubeTarget:
     points_m = entry.points_m
     if entry.slot is None:
-        return TubeTarget(index, None, None, entry.share, entry.reason, points_m)
+        return TubeTarget(index, None, None, entry.share, entry.why, points_m)
     if not tubes:
-        return TubeTarget(index, entry.slot, None, entry.share, "no tube model given (--tubes)", points_m)
+        return TubeTarget(index, entry.slot, None, entry.share, said("no_types_given", ""), points_m)
     slot = rack.slot(entry.slot)
-    tube, reason = identify_tube(class_name, points_m, tubes, rack, config.slots)
+    tube, why = identify_tube(class_name, points_m, tubes, rack, config.slots)
     if tube is not None:
         points_m = crop_to_slot(points_m, slot, tube, rack, config.slots)
-    return TubeTarget(index, entry.slot, tube, entry.share, reason, points_m)
+    return TubeTarget(index, entry.slot, tube, entry.share, why, points_m)
 
 
 def boxes_alone(scene: Scene, found: Sequence[ProfileTube], config: Config) -> list[TubeTarget]:
@@ -65,9 +66,8 @@ def boxes_alone(scene: Scene, found: Sequence[ProfileTube], config: Config) -> l
     rest = [k for k, told in zip(sure, ~holds & np.isfinite(boxes[:, 0]).all(axis=1), strict=True) if told]
     taken = {tube.slot for tube in found}
     none = "none of the given types was found in the slot" if scene.tubes else "no tube model is given (--tubes)"
-    reason = f"a tube is detected here, but {none}"
     return [
-        TubeTarget(k, entry.slot, None, entry.share, reason, entry.points_m)
+        TubeTarget(k, entry.slot, None, entry.share, said("tube_in_box_only", none), entry.points_m)
         for k, entry in zip(
             rest, _assigned(scene.frame, scene.rack, scene.detections, rest, T_camera_rack, config), strict=True
         )

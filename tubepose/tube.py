@@ -10,6 +10,7 @@ from typing import Protocol
 import numpy as np
 from scipy.optimize import minimize
 
+from tubepose.checks import Check, first_reason, reason_code, sentence
 from tubepose.config import Config, Objective
 from tubepose.labware import RackModel, SlotModel, TubeModel
 from tubepose.preprocessing import thin
@@ -24,6 +25,23 @@ class TubeStatus(StrEnum):
     FAILED = "failed"
 
 
+@dataclass(frozen=True, slots=True)
+class TopMeasure:
+    """What was measured of a tube's top, to compare with the labware's definitions.
+
+    Attributes:
+        height_m: Height of a closed top above the slot floor that the rack's file defines, along the tube's axis,
+            metres; NaN where it was not measured.
+        diameter_m: Diameter of a closed top's circle, metres; NaN where it was not measured.
+        off_m: Where the axis that the top alone tells crosses the rack's face, less the slot's centre, along the rack's
+            x and y, metres; NaN where it was not measured.
+    """
+
+    height_m: float
+    diameter_m: float = float("nan")
+    off_m: tuple[float, float] = (float("nan"), float("nan"))
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class TubePose:
     """Pose of a tube in the rack frame.
@@ -33,22 +51,44 @@ class TubePose:
         reason: In words, empty when OK.
         T_rack_tube: Array of shape (4, 4), metres; origin at the tube's bottom, z along its axis. None where
             there is no pose.
-        score: 0 to 1, larger is more trustworthy; only comparable within one method.
+        confidence: Probability that the pose is within 2 mm and 2 deg of the truth (`tubepose.confidence`) and the type
+            right; NaN where the method states no covariance.
         inlier_rmse_m: RMS of the method's own residual, metres; NaN where it has none.
         fitness: Share of the points that the pose explains; NaN where the method does not say.
         n_points: Points that the fit saw.
         covariance: Of the pose, shape (5, 5), over small turns about the tube's x and y and shifts along its x, y and z
             at its bottom, rad and metres; None where the method does not say.
+        checks: What the pose had to pass; empty from a method that has none.
+        top: What was measured of the tube's top; None from methods that do not look at it.
     """
 
     status: TubeStatus
     reason: str = ""
     T_rack_tube: FloatArray | None = None
-    score: float = float("nan")
+    confidence: float = float("nan")
     inlier_rmse_m: float = float("nan")
     fitness: float = float("nan")
     n_points: int = 0
     covariance: FloatArray | None = None
+    checks: tuple[Check, ...] = ()
+    top: TopMeasure | None = None
+
+    @property
+    def reason_code(self) -> str:
+        """Code of the first check for which it is not believed; empty when OK."""
+        return "" if self.status is TubeStatus.OK else reason_code(self.checks)
+
+
+def refused(check: Check, name: str = "", n_points: int = 0, status: TubeStatus = TubeStatus.REJECTED) -> TubePose:
+    """No pose, and the check that says why.
+
+    Args:
+        check: The check.
+        name: Of the tube or rack that its sentence speaks of.
+        n_points: Points that there were.
+        status: REJECTED, or FAILED.
+    """
+    return TubePose(status, sentence(check, name), n_points=n_points, checks=(check,))
 
 
 class TubeMethod(Protocol):
@@ -116,10 +156,10 @@ def clearance_m(tilt_rad: float, half_size_m: float, depth_m: float, body_radius
     return float(half_size_m - depth_m * np.tan(t) - body_radius_m / np.cos(t))
 
 
-def rejection(
+def wall_checks(
     alpha_rad: float, beta_rad: float, slot: SlotModel, tube: TubeModel, rack: RackModel, config: Config
-) -> str:
-    """Why the slot's walls forbid a pose (Eq. 5), in words; empty if they do not.
+) -> tuple[Check, ...]:
+    """Whether the slot's walls allow a pose (Eq. 5), along x and along y.
 
     Rotation about y (beta) leans along x, rotation about x (alpha) along y. A bottom that may stand off the centre by
     the rack's floor play leaves that much more room.
@@ -127,14 +167,12 @@ def rejection(
     half_x, half_y = slot.half_size_m
     radius = float(tube.body_radius_m(rack.depth_m))
     allowance = rack.floor_play_mm * 1e-3 + config.tube.tolerance_m
+    found = []
     for name, angle, half in (("x", beta_rad, half_x), ("y", alpha_rad, half_y)):
-        room = clearance_m(angle, half, rack.depth_m, radius) + allowance
-        if room < 0:
-            return (
-                f"leans {np.rad2deg(abs(angle)):.2f} deg along the rack's {name}: "
-                f"the body would be {-room * 1e3:.2f} mm inside the slot's wall (Eq. 5)"
-            )
-    return ""
+        inside_mm = -1e3 * (clearance_m(angle, half, rack.depth_m, radius) + allowance)
+        words = f"leans {np.rad2deg(abs(angle)):.2f} deg along the rack's {name}"
+        found.append(Check("in_wall", inside_mm, 0.0, inside_mm <= 0, detail=words))
+    return tuple(found)
 
 
 def fit_tube(
@@ -152,24 +190,22 @@ def fit_tube(
     """
     del seed
     if len(points_m) < config.tube.min_points:
-        return TubePose(
-            TubeStatus.REJECTED,
-            f"{len(points_m)} points above the rack's top, at least {config.tube.min_points} expected",
-            n_points=len(points_m),
-        )
+        few = Check("few_points", len(points_m), config.tube.min_points, False)
+        return refused(few, tube.name, len(points_m))
     points_m = thin(points_m, config.preprocess.tube_max_points)
     origin_m = rack.bottom_center_m(slot)
     radius_m = tube.max_radius_m
     alpha, beta = fit_cylinder(points_m, origin_m, radius_m, config.tube.objective, config.tube.max_tilt_rad)
     excess = np.maximum(axis_distance_m(points_m, origin_m, alpha, beta) - radius_m, 0.0)
-    reason = rejection(alpha, beta, slot, tube, rack, config)
+    checks = wall_checks(alpha, beta, slot, tube, rack, config)
+    reason = first_reason(checks, tube.name)
     fitness = float(np.mean(excess < config.tube.tolerance_m))
     return TubePose(
         TubeStatus.REJECTED if reason else TubeStatus.OK,
         reason,
         make_transform(tilt_rotation(alpha, beta), origin_m),
-        score=fitness,
         inlier_rmse_m=float(np.sqrt(np.mean(excess**2))),
         fitness=fitness,
         n_points=len(points_m),
+        checks=checks,
     )

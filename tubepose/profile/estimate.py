@@ -9,6 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tubepose.capture.frame import CameraIntrinsics, RgbdFrame
+from tubepose.checks import Check, first_reason, said, sentence
+from tubepose.confidence import confidence
 from tubepose.config import Config, ProfileConfig
 from tubepose.labware import RackModel, TubeModel
 from tubepose.preprocessing import TALLEST_TUBE_M
@@ -21,10 +23,10 @@ from tubepose.profile.plane import top_spacing_m
 from tubepose.profile.posterior import FEW_SAMPLES, Evidence, Posterior, combine, evidence, per_model
 from tubepose.profile.standing import Standing, gather_standing
 from tubepose.profile.tops import top_radius_m
-from tubepose.profile.verdict import rejection, score
+from tubepose.profile.verdict import p_type, tube_checks
 from tubepose.profile.wall import wall_evidence
 from tubepose.transforms import FloatArray, axis_rotations, transform_points
-from tubepose.tube import TubePose, TubeStatus
+from tubepose.tube import TopMeasure, TubePose, TubeStatus
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -133,7 +135,7 @@ def _fit_flat(
         slot = rack.all_slots[measured.tops.slot[i]]
         crowd = next((left.reason for left in leftovers if left.slot == measured.tops.slot[i]), "")
         if crowd and pose.status is TubeStatus.OK:
-            pose = _rejected(pose, f"two tubes in one slot: {crowd}")
+            pose = _rejected(pose, said("two_in_slot", crowd))
         found.append(ProfileTube(slot.name, tube, float(measured.tops.support[i]), clouds[i], pose))
     return (*found, *(_no_tube(left, measured.points, rack) for left in leftovers))
 
@@ -259,42 +261,53 @@ def _poses(
         "spacing_m": top_spacing_m(measured.planes, per_model(models, top_radius_m)),
     }
     columns = [values.tolist() for values in verdicts.values()]
+    sure, measures = confidence(covariance), _top_measures(measured, axis[:, 2], models, rack)
     found = []
     for i, (tube, *values) in enumerate(zip(models, *columns, strict=True)):
-        said = dict(zip(verdicts, values, strict=True))
-        reason = rejection(**said, tube=tube, rack=rack, slot=rack.all_slots[tops.slot[i]].name, config=config)
+        told = dict(zip(verdicts, values, strict=True))
+        checks = tube_checks(**told, tube=tube, rack=rack, slot=rack.all_slots[tops.slot[i]].name, config=config)
+        reason = first_reason(checks, tube.name)
         found.append(
             TubePose(
                 TubeStatus.REJECTED if reason else TubeStatus.OK,
                 reason,
                 T[i],
-                score=score(said["tilt_std_rad"], said["sectors"], said["allowed"], config),
+                confidence=float(sure[i]) * p_type(tops.support[i], tops.runner_up[i], top_radius_m(tube)),
                 inlier_rmse_m=float(measured.planes.rms_m[i]),
-                fitness=said["sectors"],
+                fitness=told["sectors"],
                 n_points=len(clouds[i]),
                 covariance=covariance[i],
+                checks=checks,
+                top=measures[i],
             )
         )
     return found
 
 
-def _rejected(pose: TubePose, reason: str) -> TubePose:
-    return TubePose(
-        TubeStatus.REJECTED,
-        reason,
-        pose.T_rack_tube,
-        pose.score,
-        pose.inlier_rmse_m,
-        pose.fitness,
-        pose.n_points,
-        pose.covariance,
-    )
+def _top_measures(
+    measured: Measured, upright: FloatArray, models: Sequence[TubeModel], rack: RackModel
+) -> list[TopMeasure]:
+    """What was measured of the tops, T of them; `upright` are the cosines of their axes' tilts, shape (T,)."""
+    held, radius = per_model(models, lambda tube: (tube.pivot_height_m, top_radius_m(tube))).reshape(-1, 2).T
+    height = (measured.planes.height_m - rack.floor_m - held) / upright + held
+    closed = np.isfinite(measured.planes.height_m)
+    diameter = np.where(closed, 2 * (radius + measured.circles.widening_m), np.nan)
+    # A closed top's normal is its axis: it leads down to the rack's face.
+    down = (measured.level_m - rack.height_m)[:, None] * measured.planes.slope
+    off = measured.center_m + down - rack.slot_centers_m[measured.tops.slot]
+    columns = zip(height.tolist(), diameter.tolist(), off.tolist(), strict=True)
+    return [TopMeasure(high, wide, (x, y)) for high, wide, (x, y) in columns]
+
+
+def _rejected(pose: TubePose, check: Check) -> TubePose:
+    return replace(pose, status=TubeStatus.REJECTED, reason=sentence(check, ""), checks=(*pose.checks, check))
 
 
 def _no_tube(left: Leftover, standing: Standing, rack: RackModel) -> ProfileTube:
     """What is left over, as a tube without a pose."""
     points_m = standing.points_m[left.rows]
     slot = rack.all_slots[left.slot].name if left.slot is not None else None
-    return ProfileTube(
-        slot, None, float("nan"), points_m, TubePose(TubeStatus.REJECTED, left.reason, n_points=len(points_m))
-    )
+    check = said(left.code, left.reason)
+    top = TopMeasure(float(np.median(points_m[:, 2])) - rack.floor_m) if left.slot is not None else None
+    pose = TubePose(TubeStatus.REJECTED, left.reason, n_points=len(points_m), checks=(check,), top=top)
+    return ProfileTube(slot, None, float("nan"), points_m, pose)

@@ -33,11 +33,13 @@ class Leftover:
         slot: Index of the slot that it stands in, or None.
         reason: What it looks like, in words.
         rows: Rows of the standing points that it is made of.
+        code: What it looks like: ``unknown_type``, ``lies_across``, ``second_top`` or ``part_of_top``.
     """
 
     slot: int | None
     reason: str
     rows: NDArray[np.intp]
+    code: str = "unknown_type"
 
 
 def find_leftovers(
@@ -91,7 +93,9 @@ def _judge(
     length_m, width_m = max(sides) * CELL_M, min(sides) * CELL_M
     if length_m > LYING_PITCHES * pitch_m and width_m > 6e-3:
         size = f"{length_m * 1e3:.0f} x {width_m * 1e3:.0f} mm"
-        return Leftover(None, f"lies across the rack: {size} seen from above, if no unknown tops touch", rows)
+        return Leftover(
+            None, f"lies across the rack: {size} seen from above, if no unknown tops touch", rows, "lies_across"
+        )
     place_m = cells.mean(axis=0) * CELL_M - half
     distance = np.linalg.norm(rack.slot_centers_m - place_m, axis=1)
     slot = int(distance.argmin())
@@ -105,13 +109,15 @@ def _judge(
     if slot in taken:
         if area_m2 < np.pi * (0.3 * pitch_m) ** 2:
             return None
-        return Leftover(slot, f"a second top in slot {rack.all_slots[slot].name}, {height_m * 1e3:.1f} mm high", rows)
+        return Leftover(
+            slot, f"a second top in slot {rack.all_slots[slot].name}, {height_m * 1e3:.1f} mm high", rows, "second_top"
+        )
     alike = [tube.name for tube in tubes if abs(tube.height_m - height_m) < SAME_HEIGHT_M]
     if alike:
         reason = (
             f"{height_m * 1e3:.1f} mm high as {alike[0]} is, but no top of it: in part, another one, or a coarse scan"
         )
-        return Leftover(slot, reason, rows)
+        return Leftover(slot, reason, rows, "part_of_top")
     heights = ", ".join(f"{tube.name} {tube.height_mm:g}" for tube in tubes)
     expected = f"expected (mm): {heights}; or it stands on something" if tubes else "no tube model given (--tubes)"
     return Leftover(slot, f"unknown type: {height_m * 1e3:.1f} mm high, {expected}", rows)

@@ -1,17 +1,24 @@
-"""Whether a tube's pose is to be believed, in words, and how much."""
+"""Whether a tube's pose is to be believed: checks with a value and a limit each, and what is known of its type."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import numpy as np
 
+from tubepose.checks import Check
 from tubepose.config import ProfileConfig
 from tubepose.labware import RackModel, TubeModel
 
 COARSE_M = 1.3e-3
 """Where the circle of a top is not seen though points that lie farther apart than this are on it, they are too few."""
+PATCH_M = 3.0e-3
+"""Side of a patch of a top whose points count as one: the range over which real scanners' depth errors are shared."""
+PATCH_NATS = float(np.log(0.95 / 0.05))
+"""What a patch that one type explains and another does not says for the one: as of the patches of slots."""
 
 
-def rejection(
+def tube_checks(
     *,
     sectors: float,
     allowed: float,
@@ -24,8 +31,8 @@ def rejection(
     looked_at: bool = True,
     runner_up: float = 0.0,
     spacing_m: float = float("nan"),
-) -> str:
-    """Why a pose cannot be believed; empty if it can.
+) -> tuple[Check, ...]:
+    """What a tube's pose has to pass, what was not seen before what was seen wrong.
 
     Args:
         sectors: Share of the top's circle that was seen.
@@ -37,35 +44,39 @@ def rejection(
         slot: Name of the slot.
         config: Limits.
         looked_at: Whether there were pixels to look at an open rim in.
-        runner_up: Support of the next best type over that of this one.
+        runner_up: Support of the next best type over that of this one; below zero without one.
         spacing_m: How far apart the points on a closed top lie, metres; NaN for an open one.
     """
-    if runner_up > config.max_runner_up:
-        return f"another of the given types fits its top as well as {tube.name} ({runner_up:.0%} of its support)"
-    if not looked_at:
-        return "an open rim is measured in the image, and this cloud has no pixels"
-    if sectors < config.min_sectors:
-        if spacing_m > COARSE_M:
-            return (
-                f"the points on its top lie {spacing_m * 1e3:.1f} mm apart: too coarse to tell where its circle ends, "
-                f"{COARSE_M * 1e3:.1f} mm or less expected"
-            )
-        return f"{sectors:.0%} of the top's circle seen, at least {config.min_sectors:.0%} expected"
-    if abs(high_m) > config.max_height_error_m:
-        return (
-            f"the top is {high_m * 1e3:+.1f} mm off the height of {tube.name} in {rack.name}: "
-            "another type, or it stands on something"
-        )
-    if allowed < config.min_allowed:
-        return (
-            f"stands or leans as slot {slot} of {rack.name} does not let it: jammed, on something, or not in the slot"
-        )
-    if tilt_std_rad > config.max_tilt_std_rad:
-        return f"its tilt is known to {np.rad2deg(tilt_std_rad):.2f} deg only"
-    return ""
+
+    def checks() -> Iterator[Check]:
+        if np.isfinite(runner_up):
+            limit = config.max_runner_up
+            yield Check("type_unclear", 100 * runner_up, 100 * limit, runner_up <= limit)
+        if tube.is_open or not looked_at:
+            yield Check("not_looked_at", float(looked_at), 1.0, looked_at)
+        enough = sectors >= config.min_sectors
+        if enough or not spacing_m > COARSE_M:
+            yield Check("circle_little_seen", 100 * sectors, 100 * config.min_sectors, enough)
+        else:
+            yield Check("points_apart", 1e3 * spacing_m, 1e3 * COARSE_M, False)
+        if np.isfinite(high_m):
+            most_m = config.max_height_error_m
+            yield Check("height_off", 1e3 * high_m, 1e3 * most_m, abs(high_m) <= most_m, detail=rack.name)
+        where = f"{slot} of {rack.name}"
+        yield Check("not_in_slot", allowed, config.min_allowed, allowed >= config.min_allowed, detail=where)
+        std_deg, limit_deg = np.rad2deg(tilt_std_rad), np.rad2deg(config.max_tilt_std_rad)
+        yield Check("tilt_uncertain", float(std_deg), float(limit_deg), tilt_std_rad <= config.max_tilt_std_rad)
+
+    return tuple(checks())
 
 
-def score(tilt_std_rad: float, sectors: float, allowed: float, config: ProfileConfig) -> float:
-    """0 to 1: falls with what is not known of the tilt, with what of the top was not seen, and at the slot's edge."""
-    known = 1 / (1 + (tilt_std_rad / config.score_tilt_rad) ** 2)
-    return float(known * min(1.0, sectors / 0.75) * min(1.0, allowed / 0.02))
+def p_type(support: float, runner_up: float, radius_m: float) -> float:
+    """Probability that a top is of its type and not of the next best one (naive Bayes over patches, equal priors).
+
+    Args:
+        support: Share of its top that is seen, less that of its surroundings.
+        runner_up: The same of the next best type; minus infinity without one.
+        radius_m: Radius of its top, metres: how many patches the shares are of.
+    """
+    patches = np.pi * (radius_m / PATCH_M) ** 2
+    return float(1 / (1 + np.exp(-np.clip(PATCH_NATS * patches * (support - runner_up), -50.0, 50.0))))

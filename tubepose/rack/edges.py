@@ -42,7 +42,7 @@ def register_edges(
     """One try of `register_rack` by this method, without the suspicions of unit and noise."""
     if len(points_m) < MIN_POINTS:
         few = f"{len(points_m)} valid points on the rack, expected at least {MIN_POINTS}"
-        return RackPose(RackStatus.INSUFFICIENT, few)
+        return RackPose(RackStatus.INSUFFICIENT, few, code="too_few_points")
     few_m = coarse_sample(points_m, config.rack_top)
     best = best_registration(points_m, few_m, levels(few_m, config.rack_top), rack, config)
     if best is not None and not best.reason:
@@ -76,13 +76,13 @@ def pose_of(
 ) -> RackPose:
     """What to report of the best registration."""
     if best is None:
-        return _not_found(points_m, rack, config.rack, "no level band")
+        return _not_found(points_m, rack, config.rack, "no level band", "no_level_band")
     spacing_m = best.agreement.spacing_m
     coarse = too_coarse(spacing_m, rack, config.rack)
     if coarse:
-        return RackPose(RackStatus.INSUFFICIENT, coarse, spacing_m=spacing_m)
+        return RackPose(RackStatus.INSUFFICIENT, coarse, spacing_m=spacing_m, code="too_coarse")
     if best.reason and not outline_fits(best.agreement, config.rack):
-        return replace(_not_found(points_m, rack, config.rack, best.reason), checks=best.checks)
+        return replace(_not_found(points_m, rack, config.rack, best.reason, ""), checks=best.checks)
     return _pose(best, points_m, rack, config, hint, intrinsics)
 
 
@@ -248,13 +248,14 @@ def _pose(
     )
 
 
-def _not_found(points_m: FloatArray, rack: RackModel, config: RackConfig, closest: str) -> RackPose:
+def _not_found(points_m: FloatArray, rack: RackModel, config: RackConfig, closest: str, code: str) -> RackPose:
     spacing_m = point_spacing_m(points_m)
     coarse = too_coarse(spacing_m, rack, config)
     if coarse:
-        return RackPose(RackStatus.INSUFFICIENT, coarse, spacing_m=spacing_m)
+        return RackPose(RackStatus.INSUFFICIENT, coarse, spacing_m=spacing_m, code="too_coarse")
     return RackPose(
         RackStatus.NOT_FOUND,
         f"no top of {rack.name} ({outline_words(rack)} mm) among the points; closest: {closest}",
         spacing_m=spacing_m,
+        code=code,
     )

@@ -66,7 +66,7 @@ def register_grid(
     """
     if len(points_m) < MIN_POINTS:
         reason = f"{len(points_m)} valid points on the rack, expected at least {MIN_POINTS}"
-        return RackPose(RackStatus.INSUFFICIENT, reason)
+        return RackPose(RackStatus.INSUFFICIENT, reason, code="too_few_points")
     # The outline is not defined but measured, to a cell.
     share = max(config.rack.max_outside_share, OUTLINE_SHARE)
     config = config.model_copy(update={"rack": config.rack.model_copy(update={"max_outside_share": share})})
@@ -79,7 +79,8 @@ def register_grid(
         told = " x ".join(f"{side:g}" for side in lattice.pitch_mm)
         doubt = unit_doubt(points_m)
         none = f"no slots {told} mm apart among the points; {MEASURE}"
-        return RackPose(RackStatus.UNIT if doubt else RackStatus.NOT_FOUND, doubt or none)
+        status, code = (RackStatus.UNIT, "wrong_unit") if doubt else (RackStatus.NOT_FOUND, "no_slots")
+        return RackPose(status, doubt or none, code=code)
     rack, best = max(found, key=lambda pair: (not pair[1].reason, pair[1].agreement.evidence))
     if best.reason:
         pose = pose_of(best, points_m, rack, config, None, intrinsics)

@@ -68,13 +68,16 @@ def name_rack(
     racks = catalogue_racks() if racks is None else racks
     if len(points_m) < MIN_POINTS:
         reason = f"{len(points_m)} valid points on the rack, expected at least {MIN_POINTS}"
-        return RackPose(RackStatus.INSUFFICIENT, reason), ()
+        return RackPose(RackStatus.INSUFFICIENT, reason, code="too_few_points"), ()
     order = sorted(_registrations(points_m, racks, config), key=lambda pair: _rank(pair[1]))
     ranking = tuple(RankedRack(rack, best.log_likelihood, best.reason) for rack, best in order)
     reason = _not_named(ranking, len(racks), config)
     if reason:
         doubt = unit_doubt(points_m)
-        return RackPose(RackStatus.UNIT if doubt else RackStatus.REFUSED, doubt or reason), ranking
+        if doubt:
+            return RackPose(RackStatus.UNIT, doubt, code="wrong_unit"), ranking
+        fits = ranking and not ranking[0].reason
+        return RackPose(RackStatus.REFUSED, reason, code="several_fit" if fits else "none_fits"), ranking
     rack, best = order[0]
     if hint is not None and not rack.has_slot(hint.slot):
         hint = None

@@ -59,7 +59,7 @@ def register_obb_icp(
     """One try of `register_rack` by this method, without the suspicions of unit and noise."""
     if len(points_m) < MIN_POINTS:
         reason = f"{len(points_m)} valid points on the rack, expected at least {MIN_POINTS}"
-        return RackPose(RackStatus.INSUFFICIENT, reason)
+        return RackPose(RackStatus.INSUFFICIENT, reason, code="too_few_points")
     top = find_rack_top(points_m, rack, config.rack_top)
     if top is None or not top.fits(config.rack_top):
         return _not_found(points_m, top, rack, config.rack)
@@ -67,7 +67,7 @@ def register_obb_icp(
     spacing_m = point_spacing_m(band)
     coarse = too_coarse(spacing_m, rack, config.rack)
     if coarse:
-        return RackPose(RackStatus.INSUFFICIENT, coarse, spacing_m=spacing_m)
+        return RackPose(RackStatus.INSUFFICIENT, coarse, spacing_m=spacing_m, code="too_coarse")
     scan = remove_outliers(voxel_downsample(band, config.preprocess.rack_voxel_m), config.preprocess)
     best, turned = _register_all(scan, top, rack, config.rack)
     margin_m = turned.inlier_rmse_m - best.inlier_rmse_m
@@ -94,6 +94,7 @@ def register_obb_icp(
         else "",
         turn_margin_m=margin_m if chosen is best else -margin_m,
         spacing_m=spacing_m,
+        code="other_fit" if reason else "",
     )
 
 
@@ -101,12 +102,13 @@ def _not_found(points_m: FloatArray, top: RackTop | None, rack: RackModel, confi
     spacing_m = point_spacing_m(points_m)
     coarse = too_coarse(spacing_m, rack, config)
     if coarse:
-        return RackPose(RackStatus.INSUFFICIENT, coarse, spacing_m=spacing_m)
+        return RackPose(RackStatus.INSUFFICIENT, coarse, spacing_m=spacing_m, code="too_coarse")
     found = "no level band" if top is None else f"a band of {top.size_m[0] * 1e3:.1f} x {top.size_m[1] * 1e3:.1f} mm"
     return RackPose(
         RackStatus.NOT_FOUND,
         f"no top of {rack.name} ({outline_words(rack)} mm) among the points; closest: {found}",
         spacing_m=spacing_m,
+        code="no_level_band" if top is None else "other_outline",
     )
 
 

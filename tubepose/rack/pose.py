@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from enum import StrEnum
 
-from tubepose.checks import Check
+from tubepose.checks import Check, reason_code
 from tubepose.labware import RackModel
 from tubepose.rack.size import FaceSize
 from tubepose.transforms import FloatArray
@@ -57,6 +57,9 @@ class RackPose:
         bow_std_m: Standard deviations of that, shape (3,).
         named_by_nats: By how much likelier the rack is than the next one of the catalogue that passes every check,
             where it was named by that; infinity where no other passes, NaN where a person named it.
+        code: Why there is no pose where no check says it: ``too_few_points``, ``no_level_band``, ``too_coarse``,
+            ``too_noisy``, ``wrong_unit``, ``no_detection``, ``other_outline``, ``other_fit`` (of `obb-icp`),
+            ``none_fits``, ``several_fit`` (of `--rack auto`), ``no_slots`` (of `--rack grid`).
     """
 
     status: RackStatus
@@ -80,3 +83,9 @@ class RackPose:
     floor_m: tuple[float, float] | None = None
     bow_m: FloatArray | None = None
     bow_std_m: FloatArray | None = None
+    code: str = ""
+
+    @property
+    def reason_code(self) -> str:
+        """Why there is no pose, as a code: `code`, or else that of the first check that failed; empty when OK."""
+        return "" if self.status is RackStatus.OK else self.code or reason_code(self.checks)

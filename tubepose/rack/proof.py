@@ -173,12 +173,7 @@ def _scale(size: FaceSize, rack: RackModel, distance_m: float, config: RackConfi
 
     An outline's edge is moved by blur as well: its part is as sure as that.
     """
-    half = rack.outline_m / 2
-    values = np.concatenate([size.stretch, size.outline_m / half])
-    covariance = size.covariance[np.ix_([0, 1, 3, 4], [0, 1, 3, 4])] / np.outer([1, 1, *half], [1, 1, *half])
-    covariance = covariance + np.diag([0, 0, *(config.edge_std_mm * 1e-3 / half) ** 2])
-    weights = np.linalg.solve(covariance, np.ones(4))
-    scale, std = float(weights @ values / weights.sum()), float(weights.sum() ** -0.5)
+    scale, std = size.scale(rack, config.edge_std_mm * 1e-3)
     words = "larger" if scale > 0 else "smaller"
     moved_mm = 1e3 * abs(scale) * distance_m
     significant = abs(scale) > 3 * std and moved_mm > config.max_scale_shift_mm

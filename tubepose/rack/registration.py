@@ -54,11 +54,12 @@ def register_rack(
     # Asked of a too coarse scan as well: millimetres read as metres are one.
     reason = _unit_suspicion(points_m, rack, config, method)
     if reason:
-        return replace(pose, status=RackStatus.UNIT, reason=reason)
+        return replace(pose, status=RackStatus.UNIT, reason=reason, code="wrong_unit")
     if pose.status is not RackStatus.INSUFFICIENT:
         noise_m = _noise_m(points_m, config)
         if noise_m > config.rack.max_inlier_rmse_m:
-            return replace(pose, status=RackStatus.INSUFFICIENT, reason=too_noisy(noise_m, pose.reason, config.rack))
+            words = too_noisy(noise_m, pose.reason, config.rack)
+            return replace(pose, status=RackStatus.INSUFFICIENT, reason=words, code="too_noisy")
     return pose
 
 

@@ -65,6 +65,20 @@ class FaceSize:
         value = self.openings_m + float(self.outline_m.mean())
         return value, float(np.sqrt(pick @ self.covariance @ pick))
 
+    def scale(self, rack: RackModel, edge_std_m: float) -> tuple[float, float]:
+        """One stretch of pitch and outline by least squares, a share, and its standard deviation.
+
+        Args:
+            rack: The rack.
+            edge_std_m: How far blur moves an outline's edge, metres: its part is as sure as that.
+        """
+        half = rack.outline_m / 2
+        values = np.concatenate([self.stretch, self.outline_m / half])
+        covariance = self.covariance[np.ix_([0, 1, 3, 4], [0, 1, 3, 4])] / np.outer([1, 1, *half], [1, 1, *half])
+        covariance = covariance + np.diag([0, 0, *(edge_std_m / half) ** 2])
+        weights = np.linalg.solve(covariance, np.ones(4))
+        return float(weights @ values / weights.sum()), float(weights.sum() ** -0.5)
+
     def with_tops(self, tops: TopsInSlots) -> FaceSize:
         """The same, its stretch weighed with that of tops in the slots (inverse variances, axis by axis)."""
         # What the tops say of the stretch, as one more measurement of each: Kalman's update.

@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 from scipy.spatial import ConvexHull, QhullError
 
+from tubepose.checks import Check, said
 from tubepose.config import SlotConfig
 from tubepose.detection.model import CAPPED_CLASS, OPEN_CLASS, TUBE_CLASS, visible_class
 from tubepose.labware import RackModel, SlotModel, TubeModel
@@ -29,14 +30,14 @@ class SlotAssignment:
         detection: Index of the detection.
         slot: Name of the slot, or None if the tube stands on none.
         share: Share of the projected hull's area that lies in that slot's opening.
-        reason: Why there is no slot; empty otherwise.
+        why: Why there is no slot; None where there is one.
         points_m: The tube's points above the rack's top, rack frame, shape (N, 3), metres.
     """
 
     detection: int
     slot: str | None
     share: float
-    reason: str
+    why: Check | None
     points_m: FloatArray
 
 
@@ -86,7 +87,7 @@ def assign_slots(tubes_m: Sequence[FloatArray], rack: RackModel, config: SlotCon
     shares = np.array([slot_shares(points, rack) for points in above]).reshape(len(above), len(rack.all_slots))
     names = [slot.name for slot in rack.all_slots]
     taken: dict[int, int] = {}
-    reasons = ["no points above the rack's top" if len(points) == 0 else "" for points in above]
+    reasons = [Check("no_points_above", 0, 1, False) if len(points) == 0 else None for points in above]
     candidates = [
         (tube, int(slot)) for tube in range(len(above)) for slot in np.flatnonzero(shares[tube] >= config.min_share)
     ]
@@ -94,20 +95,18 @@ def assign_slots(tubes_m: Sequence[FloatArray], rack: RackModel, config: SlotCon
         if tube in taken:
             continue
         if slot in taken.values():
-            reasons[tube] = f"slot {names[slot]} holds another tube"
+            reasons[tube] = said("slot_taken", names[slot])
             continue
         taken[tube] = slot
     found = []
     for tube, points in enumerate(above):
         chosen = taken.get(tube)
         if chosen is None:
-            reason = (
-                reasons[tube]
-                or f"at most {shares[tube].max(initial=0.0):.0%} of it is above one slot: lies across the rack?"
-            )
-            found.append(SlotAssignment(tube, None, float(shares[tube].max(initial=0.0)), reason, points))
+            most = float(shares[tube].max(initial=0.0))
+            why = reasons[tube] or Check("in_no_slot", 100 * most, 100 * config.min_share, False)
+            found.append(SlotAssignment(tube, None, most, why, points))
         else:
-            found.append(SlotAssignment(tube, names[chosen], float(shares[tube, chosen]), "", points))
+            found.append(SlotAssignment(tube, names[chosen], float(shares[tube, chosen]), None, points))
     return tuple(found)
 
 
@@ -140,7 +139,7 @@ def crop_to_slot(
 
 def identify_tube(
     class_name: str, points_m: FloatArray, candidates: Sequence[TubeModel], rack: RackModel, config: SlotConfig
-) -> tuple[TubeModel | None, str]:
+) -> tuple[TubeModel | None, Check | None]:
     """The tube model of a detection, by its class where the detector gives one, else by the height of its points.
 
     Args:
@@ -152,18 +151,19 @@ def identify_tube(
         config: Tolerance of the height.
 
     Returns:
-        The model and an empty reason, or None and the reason.
+        The model and None, or None and the check that says why.
     """
     named = [tube for tube in candidates if class_name == tube.name or class_name in tube.classes]
     if named:
-        return named[0], ""
+        return named[0], None
     if class_name in (CAPPED_CLASS, OPEN_CLASS):
         seen = [tube for tube in candidates if visible_class(closed=not tube.is_open) == class_name]
         # A cap is easily taken for an opening from above: where no such tube is there, height alone decides.
         candidates = seen or candidates
     elif class_name != TUBE_CLASS:
         known = sorted({word for tube in candidates for word in (tube.name, *tube.classes)})
-        return None, f"class '{class_name}' belongs to none of the tubes given (they answer to {', '.join(known)})"
+        words = f"'{class_name}' belongs to none of the tubes given (they answer to {', '.join(known)})"
+        return None, said("unknown_class", words)
     height_m = float(np.percentile(points_m[:, 2], 95)) - rack.floor_m
     differences = [abs(tube.height_m - height_m) for tube in candidates]
     order = np.argsort(differences)
@@ -171,8 +171,8 @@ def identify_tube(
     sunk = nearest.is_open and height_m < nearest.height_m
     if differences[order[0]] > (config.open_depth_m if sunk else config.height_tolerance_m):
         heights = ", ".join(f"{tube.name} {tube.height_mm:g}" for tube in candidates)
-        return None, f"unknown type: {height_m * 1e3:.1f} mm high, expected (mm): {heights}"
+        return None, said("unknown_type", f"unknown type: {height_m * 1e3:.1f} mm high, expected (mm): {heights}")
     if len(candidates) > 1 and differences[order[1]] - differences[order[0]] < 0.4 * config.height_tolerance_m:
         alike = f"{candidates[order[0]].name} and {candidates[order[1]].name}"
-        return None, f"{height_m * 1e3:.1f} mm high: {alike} are not told apart by height"
-    return candidates[order[0]], ""
+        return None, said("types_alike", alike, 1e3 * height_m)
+    return candidates[order[0]], None
