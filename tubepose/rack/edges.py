@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
-from itertools import islice
+from itertools import chain, islice
 
 import numpy as np
 
@@ -21,7 +21,7 @@ from tubepose.rack.fit import RoughFit, filled, rack_frame, top_frame
 from tubepose.rack.insufficient import outline_words, too_coarse
 from tubepose.rack.looks import on_lattice, seen_near
 from tubepose.rack.pose import MIN_POINTS, RackPose, RackStatus
-from tubepose.rack.search import Band, levels, search
+from tubepose.rack.search import Band, Hypothesis, levels, search, search_by_tops
 from tubepose.rack.settling import Registration, likelihood_at, settled
 from tubepose.rack.turns import choose_turn, turns_of, unused_hint
 from tubepose.transforms import FloatArray, translation
@@ -30,6 +30,8 @@ from tubepose.transforms import FloatArray, translation
 RIVAL_WORTH = 0.4
 # The fine rounds add no more than this to a pose's evidence.
 ROUGH_MARGIN = 1.05
+# Places that are looked at where tubes hide a rack.
+MOST_HIDDEN = 4
 # Of a face of which so much is seen a rack that looks alike is told by its openings.
 MUCH_SEEN = 0.4
 # A rack that tubes in so many of its slots hold is nowhere else.
@@ -111,15 +113,22 @@ def best_registration(
     """
     found: list[Registration] = []
     been: list[FloatArray] = []
+    searched: list[list[Band]] = []
     worth = 0.0
 
     def until_settled() -> Iterator[list[Band]]:
         for level in found_levels:
+            searched.append(level)
             yield level
             if any(not other.reason and _uncontradicted(other, config.rack) for other in found):
                 return
 
-    for hypothesis in islice(search(until_settled(), rack), most):
+    def hidden() -> Iterator[Hypothesis]:
+        """Where nothing was accepted, tubes may hide the rack."""
+        if all(other.reason for other in found):
+            yield from islice(search_by_tops(searched, few_m, rack), MOST_HIDDEN)
+
+    for hypothesis in chain(islice(search(until_settled(), rack), most), hidden()):
         if hypothesis.worth < RIVAL_WORTH * worth or _known(hypothesis.T_camera_rack, been, rack):
             continue
         near_m, rough = on_lattice(few_m, hypothesis.T_camera_rack, rack)
