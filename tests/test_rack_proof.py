@@ -207,7 +207,7 @@ def test_tops_tell_how_far_apart_slots_lie(stretch, bow):
     T = scenes.camera_from_rack(SOFT)
     seen = tops_in_slots(transform_points(T, tops(SOFT, stretch, bow, 0.2e-3)), top_frame(T, SOFT), bow, SOFT)
     assert seen.count == len(SOFT.all_slots)
-    assert seen.rms_share < 0.12
+    assert seen.median_share < 0.12
     assert abs(seen.stretch[0] - stretch) < 2 * seen.std[0]
     assert abs(seen.stretch[1]) < 2 * seen.std[1]
     assert np.all(seen.std < 0.02)
@@ -217,7 +217,7 @@ def test_tops_half_a_slot_off_are_told():
     T = scenes.camera_from_rack(SOFT)
     moved = tops(SOFT) + np.array([GRID.pitch_mm[0] * 0.4e-3, 0.0, 0.0])
     seen = tops_in_slots(transform_points(T, moved), top_frame(T, SOFT), FLAT, SOFT)
-    assert seen.rms_share > CONFIG.rack.max_tops_off
+    assert seen.median_share > CONFIG.rack.max_tops_off
 
 
 def test_no_tops_tell_nothing():

@@ -119,8 +119,8 @@ class RackConfig(_Section):
         max_scale: Largest difference of scale, as a share, of everything that is seen of the rack.
         max_scale_shift_mm: A difference of scale that moves the rack by more along the line of sight is marked.
         edge_std_mm: How far a sensor's blur and a projector's shadow move the edge of an outline.
-        max_tops_off: How far the tops of what stands in the slots may lie from the slots' centres, root of the mean
-            square as a share of the distance of slots: tubes lean by less than a tenth, and tops anywhere give 0.38.
+        max_tops_off: How far the tops of what stands in the slots may lie from the slots' centres, median, as a share of
+            the distance of slots: tubes lean by a tenth, and tops anywhere give 0.4.
         max_bow_mm: Largest bow of a face, at the ends of its outline (two of two real racks: 0.7 to 2 mm).
         max_floor_mm: How far the slots' floor may be seen from where the file has it, beside three standard deviations.
         min_seen: Smallest share of the template that is seen: a rack full of caps shows 5 to 24 %.

@@ -147,7 +147,7 @@ def _beside(face: Face, rack: RackModel) -> Iterator[Check]:
 
 def _tops(tops: TopsInSlots, config: RackConfig) -> Iterator[Check]:
     if tops.count >= LEAST_TOPS:
-        yield Check("tops_off_slots", tops.rms_share, config.max_tops_off, tops.rms_share <= config.max_tops_off)
+        yield Check("tops_off_slots", tops.median_share, config.max_tops_off, tops.median_share <= config.max_tops_off)
 
 
 def _sizes(size: FaceSize, rack: RackModel, config: RackConfig) -> Iterator[Check]:
