@@ -265,6 +265,8 @@ def _weighed(values: FloatArray, stds: FloatArray) -> tuple[float, float]:
 
 def _tube_sizes(scene: Scene, estimates: Sequence[TubeEstimate], config: Config) -> Iterator[SizeCheck]:
     """Heights and diameters of closed tops, type by type."""
+    if scene.rack.floor_tolerance_mm > TOLERANCE_MM:
+        return  # its floor was set by these very tops
     shift_mm, shared_mm = _floor_shift_mm(scene.rack_pose, scene.rack)
     floor_key = "floor_mm" if scene.rack_pose.floor_m is None else ""
     cap_mm = 1e3 * config.profile.cap_height_m
@@ -276,9 +278,8 @@ def _tube_sizes(scene: Scene, estimates: Sequence[TubeEstimate], config: Config)
         ]
         heights = 1e3 * np.array([top.height_m for top in tops]) - shift_mm
         heights = heights[np.isfinite(heights)]
-        strange = len(tops) == 0
-        if strange:
-            heights = _strangers_mm(tube, scene.tubes, estimates) - shift_mm
+        strange = len(heights) == 0
+        heights = _with_strangers(heights, tube, scene.tubes, estimates, shift_mm)
         if len(heights):
             std = float(np.hypot(max(_scatter(heights), cap_mm) / np.sqrt(len(heights)), shared_mm))
             yield _height(tube, float(np.median(heights)), std, len(heights), floor_key, strange)
@@ -304,25 +305,37 @@ def _height(tube: TubeModel, found_mm: float, std_mm: float, n: int, floor_key: 
     return SizeCheck("top_height_mm", tube.name, key, tube.height_mm, found_mm, std_mm, n, TOLERANCE_MM, write, other)
 
 
-def _strangers_mm(tube: TubeModel, tubes: Sequence[TubeModel], estimates: Sequence[TubeEstimate]) -> FloatArray:
-    """Heights of tops of no given type that are nearer to this one's than to another's, and alike; else none."""
+def _with_strangers(
+    heights_mm: FloatArray,
+    tube: TubeModel,
+    tubes: Sequence[TubeModel],
+    estimates: Sequence[TubeEstimate],
+    shift_mm: float,
+) -> FloatArray:
+    """Heights of a type's tops, with those of no given type that are nearer to its height than to another's.
+
+    Only tops near a type's defined height are taken for it: where that is wrong, the others are among the unknown ones.
+    Without any of the type, they count if they are several and alike.
+    """
     found = [
-        1e3 * e.pose.top.height_m
+        1e3 * e.pose.top.height_m - shift_mm
         for e in estimates
         if e.target.tube is None and e.pose.top is not None and e.pose.reason_code == "unknown_type"
     ]
     nearest = [min(tubes, key=lambda one: abs(one.height_mm - height)) for height in found]
     mine = np.array([height for height, one in zip(found, nearest, strict=True) if one == tube])
     mine = mine[np.abs(mine - tube.height_mm) < MAX_OFF_MM]
+    if len(heights_mm):
+        return np.concatenate([heights_mm, mine[np.abs(mine - np.median(heights_mm)) < 2 * TOLERANCE_MM]])
     alike = len(mine) >= LEAST_STRANGERS and float(np.ptp(mine)) < 2 * TOLERANCE_MM
     return mine if alike else np.empty(0)
 
 
 def _floor_shift_mm(pose: RackPose, rack: RackModel) -> tuple[float, float]:
-    """How much higher the slots' floor is than defined, as seen, and the error that all heights over it share."""
+    """How much higher the slots' floor is than defined, as seen, and the error that a frame's heights over it share."""
     face_mm = 0.0 if pose.covariance is None else 1e3 * float(np.sqrt(pose.covariance[5, 5]))
     if pose.floor_m is None:
-        return 0.0, float(np.hypot(rack.floor_tolerance_mm, face_mm))
+        return 0.0, face_mm
     return 1e3 * (pose.floor_m[0] - rack.floor_m), float(np.hypot(1e3 * pose.floor_m[1], face_mm))
 
 
