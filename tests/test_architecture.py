@@ -31,7 +31,7 @@ ALLOWED: dict[str, set[str]] = {
     "rack": {"capture", "checks", "compiled", "config", "labware", "preprocessing"},
     "slots": {"capture", "compiled", "config", "labware", "preprocessing", "detection", "rack"},
     "tube": {"config", "labware", "preprocessing", "slots"},
-    "profile": {"capture", "compiled", "config", "labware", "preprocessing", "tube"},
+    "profile": {"capture", "compiled", "config", "labware", "preprocessing", "sensor", "tube"},
     "baselines": {"config", "labware", "preprocessing", "slots", "tube"},
     "rivals": {"config", "labware", "tube", "baselines"},
     "scene": {"capture", "detection", "labware", "rack", "sensor", "slots", "stage_times", "tube"},
