@@ -266,6 +266,7 @@ class ProfileConfig(_Section):
         reach_m: Added to what a slot lets a tube's top reach, for the rack's error and for looser slots.
         plane_points: Points of a top that its plane is fitted to.
         min_top_points: Fewer points than this make no plane.
+        edge_ramp_m: Width of the ramp that the end of a top is, beyond that of today's scanner: set frame by frame.
         outline_noise_m: Standard deviation of the radius at which a sector of a top ends.
         outline_bias_m: Standard deviation of a circle's middle beyond what its sectors explain.
         rim_noise_m: As `outline_noise_m`, of the bright ring of a rim.
@@ -301,6 +302,7 @@ class ProfileConfig(_Section):
     reach_m: float = 1.5e-3
     plane_points: int = 400
     min_top_points: int = 30
+    edge_ramp_m: float = 0.0
     outline_noise_m: float = 1.7e-4
     outline_bias_m: float = 9.0e-5
     widening_m: float = Field(default=3.0e-4, gt=0)

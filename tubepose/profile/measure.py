@@ -279,8 +279,8 @@ def _measure_closed(
     planes = fit_top_planes(of, offset, standing.points_m[rows, 2], shape.level_m, shape.radius_m, config)
     ends_of, flat = ends_on_planes(
         standing.points_m, rows, of, offset, np.column_stack([planes.height_m, planes.slope]),
-        np.maximum(shape.radius_m - OUTLINE_DEPTH_M, 0.0), config.top_band_m * ON_PLANE_SHARE, tops.center_m,
-        standing.camera_m,
+        np.maximum(shape.radius_m - OUTLINE_DEPTH_M - config.edge_ramp_m, 0.0), config.top_band_m * ON_PLANE_SHARE,
+        tops.center_m, standing.camera_m,
     )  # fmt: skip
     blocked = blocked_sectors(tops.center_m, shape.radius_m, DISC_GAP_M)
     return planes, fit_discs(ends_of, flat, shape.radius_m, blocked, config)

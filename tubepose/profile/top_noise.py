@@ -9,7 +9,7 @@ import numpy as np
 
 from tubepose.config import Config, ProfileConfig
 from tubepose.labware import RackModel, TubeModel
-from tubepose.profile.measure import Measured
+from tubepose.profile.measure import ON_PLANE_SHARE, Measured
 from tubepose.profile.plane import EDGE_M
 from tubepose.profile.posterior import per_model
 from tubepose.profile.tops import top_radius_m
@@ -57,11 +57,13 @@ def noisy_config(config: Config, noise: SensorNoise, T_camera_rack: FloatArray, 
     profile, prior = config.profile, config.sensor
     # A ramp of so many pixels ends anywhere within it; what today's scanner has of it is in the outline's own noise.
     ramp2 = (noise.edge_blur_px * noise.spacing_m * scale) ** 2 - (prior.edge_blur_px * prior.spacing_m) ** 2
-    blur_m = float(np.sqrt(max(ramp2, 0.0) / 12)) if noise.edge_source != PRIOR else 0.0
+    ramp_m = float(np.sqrt(max(ramp2, 0.0))) if noise.edge_source != PRIOR else 0.0
+    blur_m = ramp_m / float(np.sqrt(12))
     changed = {
         "top_band_m": float(np.hypot(profile.top_band_m, BAND_STDS * point_m)),
+        "edge_ramp_m": ramp_m,
         "outline_noise_m": float(np.hypot(profile.outline_noise_m, blur_m)),
-        # All of a blurred circle is smaller or larger.
+        # All of a blurred circle is smaller.
         "widening_m": float(np.hypot(profile.widening_m, blur_m)),
     }
     return config.model_copy(update={"profile": profile.model_copy(update=changed)})
@@ -111,9 +113,12 @@ def believed(
     closed = np.isfinite(planes.height_m)
     lower = np.where(closed, (1 - gain) * np.nan_to_num(expected - planes.height_m), 0.0)
     left = np.where(closed, gain * height_var, 0.0)
+    slant = np.linalg.norm(sight, axis=1)
+    along = sight / np.maximum(slant, 1e-9)[:, None]
+    var = left * slant**2 + np.where(closed, _ramp_shift_m(slant, config) ** 2, 0.0)
     circles = replace(
         measured.circles,
-        covariance_m2=measured.circles.covariance_m2 + left[:, None, None] * sight[:, :, None] * sight[:, None, :],
+        covariance_m2=measured.circles.covariance_m2 + var[:, None, None] * along[:, :, None] * along[:, None, :],
     )
     known = replace(planes, slope_var=np.maximum(planes.slope_var, slope_std**2))
     changed = replace(
@@ -132,6 +137,18 @@ def height_limit_m(height_var_m2: FloatArray, config: ProfileConfig) -> FloatArr
     `max_height_error_m` is that limit where a cap's seat `cap_height_m` is all that is uncertain.
     """
     return np.asarray(config.max_height_error_m * np.hypot(1.0, np.sqrt(height_var_m2) / config.cap_height_m))
+
+
+def _ramp_shift_m(slant: FloatArray, config: ProfileConfig) -> FloatArray:
+    """How far a blurred edge may move the middle of a disc along the line of sight, shape (T,), metres.
+
+    An average over a ramp's width w takes w / 2 off the disc at its far side, where depth drops at once. At the near
+    side, where the wall below the top is seen, it drops by u / slant at a distance u: less is taken off, by up to
+    sqrt(2 w slant h), h how far points may lie off the top's plane. The middle moves by half of the difference. Cameras
+    whose windows make things larger do the opposite, so it is an uncertainty and no correction.
+    """
+    w = config.edge_ramp_m
+    return np.asarray(np.minimum(w / 2, np.sqrt(2 * w * slant * config.top_band_m * ON_PLANE_SHARE)) / 2)
 
 
 def _rack_height_var(xy_m: FloatArray, covariance: FloatArray | None) -> FloatArray:

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from tubepose.sensor.noise import CAPS, SensorNoise
+from tubepose.sensor.noise import CAPS, PRIOR, RACK_TOP, SensorNoise, slope_gain
 from tubepose.transforms import FloatArray
 
 CELLS = 4
@@ -32,6 +32,8 @@ COMPARED_M = 6.5e-3
 """Radius of the discs that two witnesses are compared by: a cap's."""
 SURE = 2.0
 """Standard deviations by which the caps' noise must be the smaller one."""
+UNSURE = 0.5
+"""Caps that tell their noise worse than to this share say less than a prior does."""
 ROUND_M = 5e-5
 """Caps whose radii differ by less have one grid."""
 
@@ -82,7 +84,8 @@ class CapsError:
         independent_m: Standard deviation of a point's own error, metres.
         shared_m: Standard deviation of what neighbours share, metres.
         correlation_m: Distance at which its correlation is 1/e, metres.
-        relative_std: How well the shared error is known, as a share of it, by the Fisher information.
+        relative_std: How well the slope error of planes through such caps is known, as a share of it: over all
+            lengths and shared errors by their likelihood.
         independent_relative_std: How well the independent error is known.
         spacing_m: Distance of neighbouring points.
         n_caps: How many caps.
@@ -100,14 +103,16 @@ class CapsError:
 def seen_on_caps(noise: SensorNoise, discs: Sequence[CapDisc]) -> SensorNoise:
     """The caps' noise where it is surely smaller than that of the rack's top, which stray light makes an upper bound.
 
+    Where no surface was seen at all, the caps' noise takes the place of what is assumed.
+
     Args:
-        noise: Of the rack's top.
+        noise: Of the rack's top, or the prior; a table's is returned as it is.
         discs: Flat tops of caps of the same frame.
 
     Returns:
         The smaller of the two, at the same reference distance; `source` says which.
     """
-    error = caps_error(discs, noise.distance_m)
+    error = caps_error(discs, noise.distance_m) if noise.source in (RACK_TOP, PRIOR) else None
     if error is None:
         return noise
     caps = replace(
@@ -122,6 +127,10 @@ def seen_on_caps(noise: SensorNoise, discs: Sequence[CapDisc]) -> SensorNoise:
         n_patches=error.n_caps,
         source=CAPS,
     )
+    if noise.source == PRIOR:
+        if error.relative_std > UNSURE:
+            return noise
+        return replace(caps, note="no level surface was seen; told by the caps alone, whose own form counts as noise")
     here, there = (one.slope_std(COMPARED_M, noise.distance_m) for one in (caps, noise))
     if here * (1 + SURE * error.relative_std) >= there:
         return noise
@@ -152,14 +161,21 @@ def caps_error(discs: Sequence[CapDisc], distance_m: float) -> CapsError | None:
         return None
     longest = LONGEST * max(disc.radius_m for disc in scaled)
     lengths = np.geomspace(min(grid.side_m for grid in grids) / 2, longest, LENGTHS)
-    fits = [_likelihood(grids, float(length)) for length in lengths]
-    best = int(np.argmin([cost for cost, _, _, _ in fits]))
-    _, own, shared, known = fits[best]
+    cost, own, shared = (
+        np.array(values) for values in zip(*(_likelihood(grids, float(length)) for length in lengths), strict=True)
+    )
+    best = np.unravel_index(int(np.argmin(cost)), cost.shape)
+    radius = float(np.median([disc.radius_m for disc in scaled]))
+    gain = np.array([slope_gain(length / radius) for length in lengths])[:, None]
+    slope = np.sqrt(own * spacing**2 / (np.pi * radius**2) + shared * gain)
+    weight = np.exp(0.5 * (cost.min() - cost))
+    mean = np.sum(weight * slope) / weight.sum()
+    known = float(np.sqrt(np.sum(weight * (slope - mean) ** 2) / weight.sum()) / mean)
     free = sum(grid.free for grid in grids)
     n_caps = sum(len(grid.means_m) for grid in grids)
     return CapsError(
-        float(np.sqrt(own)), float(np.sqrt(shared)), float(lengths[best]), known, float(1 / np.sqrt(2 * free)), spacing,
-        n_caps,
+        float(np.sqrt(own[best])), float(np.sqrt(shared[best])), float(lengths[best[0]]), known,
+        float(1 / np.sqrt(2 * free)), spacing, n_caps,
     )  # fmt: skip
 
 
@@ -195,26 +211,24 @@ def _grid(discs: Sequence[CapDisc], spacing_m: float) -> _Grid | None:
     return _Grid(centers, side, np.array(means), float(np.mean(per_point)), squares, free)
 
 
-def _likelihood(grids: Sequence[_Grid], length_m: float) -> tuple[float, float, float, float]:
-    """Cost (-2 log likelihood), independent and shared variance, and how well the shared error is known."""
-    within = sum(grid.squares for grid in grids) / sum(grid.free for grid in grids)
-    tried = np.concatenate([[0.0], within * np.geomspace(LEAST_SHARED, MOST_SHARED, SHARED_STEPS) ** 2])
-    cost, information = np.zeros(len(tried)), np.zeros(len(tried))
+def _likelihood(grids: Sequence[_Grid], length_m: float) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Cost (-2 log likelihood), independent and shared variance, shape (M,) each, of the shared errors that are tried.
+
+    The independent one is what is left of the variance within cells.
+    """
     free = sum(grid.free for grid in grids)
+    within = sum(grid.squares for grid in grids) / free
+    shared = np.concatenate([[0.0], within * np.geomspace(LEAST_SHARED, MOST_SHARED, SHARED_STEPS) ** 2])
     # What neighbours share differs within a cell by this share of its variance.
-    lost = sum(grid.free * (1 - _pooled(length_m, grid.side_m)) for grid in grids) / free
-    own = np.maximum(within - tried * lost, 1e-3 * within)
-    shared_within = own + tried * lost
-    cost += free * (np.log(shared_within) + within / shared_within)
+    differs = sum(grid.free * (1 - _pooled(length_m, grid.side_m)) for grid in grids) / free
+    own = np.maximum(within - shared * differs, 1e-3 * within)
+    expected = own + shared * differs
+    cost = free * (np.log(expected) + within / expected)
     for grid in grids:
         values, powers = _spectrum(grid, length_m)
-        variance = own[:, None] * grid.per_point + tried[:, None] * values
-        cost += np.sum(len(grid.means_m) * np.log(variance) + powers / variance, axis=1)
-        information += 0.5 * len(grid.means_m) * np.sum((values / variance) ** 2, axis=1)
-    best = int(np.argmin(cost))
-    least = max(float(tried[best]), float(tried[1]))
-    known = 1 / (2 * least * np.sqrt(max(float(information[best]), 1e-300)))
-    return float(cost[best]), float(own[best]), float(tried[best]), float(known)
+        variance = own[:, None] * grid.per_point + shared[:, None] * values
+        cost = cost + np.sum(len(grid.means_m) * np.log(variance) + powers / variance, axis=1)
+    return np.asarray(cost), own, shared
 
 
 def _spectrum(grid: _Grid, length_m: float) -> tuple[FloatArray, FloatArray]:
