@@ -9,6 +9,7 @@ import numpy as np
 
 from tubepose.config import Config, ProfileConfig
 from tubepose.labware import RackModel, TubeModel
+from tubepose.profile.kernels import grouped
 from tubepose.profile.measure import ON_PLANE_SHARE, Measured
 from tubepose.profile.plane import EDGE_M
 from tubepose.profile.posterior import per_model
@@ -177,11 +178,12 @@ def cap_discs(measured: Measured, models: Sequence[TubeModel], T_camera_rack: Fl
         models: Their types.
         T_camera_rack: The rack's pose, shape (4, 4), metres.
     """
-    points_m, planes = measured.points.points_m, measured.planes
+    planes = measured.planes
+    points_m, ends = grouped(measured.points.points_m, measured.label, len(models))
     found = {}
     for i in np.flatnonzero(np.isfinite(planes.height_m)).tolist():
         radius_m = top_radius_m(models[i]) - EDGE_M
-        own = points_m[measured.label == i]
+        own = points_m[ends[i] : ends[i + 1]]
         xy_m = own[:, :2] - measured.tops.center_m[i]
         off_m = own[:, 2] - planes.height_m[i] - xy_m @ planes.slope[i]
         # What lies farther off than that is of something else.

@@ -34,8 +34,8 @@ SURE = 2.0
 """Standard deviations by which the caps' noise must be the smaller one."""
 UNSURE = 0.5
 """Caps that tell their noise worse than to this share say less than a prior does."""
-ROUND_M = 5e-5
-"""Caps whose radii differ by less have one grid."""
+ALIKE = 0.2
+"""Caps whose radii differ by less than this share have one grid, which fits the smallest: each one costs time."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -61,6 +61,7 @@ class _Grid:
 
     Attributes:
         centers_m: Middles of the cells, shape (K, 2).
+        off_planes: Orthonormal basis of what no plane explains, shape (K, K - 3).
         side_m: Side of a cell.
         means_m: Mean distance in every cell of every cap, shape (D, K).
         per_point: Mean over cells of one over its number of points.
@@ -69,6 +70,7 @@ class _Grid:
     """
 
     centers_m: FloatArray
+    off_planes: FloatArray
     side_m: float
     means_m: FloatArray
     per_point: float
@@ -155,7 +157,7 @@ def caps_error(discs: Sequence[CapDisc], distance_m: float) -> CapsError | None:
     spacing = float(np.median([np.sqrt(np.pi * d.radius_m**2 / len(d.off_m)) for d in scaled]))
     by_radius: dict[int, list[CapDisc]] = {}
     for disc in scaled:
-        by_radius.setdefault(round(disc.radius_m / ROUND_M), []).append(disc)
+        by_radius.setdefault(round(np.log(disc.radius_m) / ALIKE), []).append(disc)
     grids = [grid for group in by_radius.values() if (grid := _grid(group, spacing)) is not None]
     if not grids:
         return None
@@ -208,7 +210,9 @@ def _grid(discs: Sequence[CapDisc], spacing_m: float) -> _Grid | None:
     if not means or free < LEAST_CELLS:
         return None
     centers: FloatArray = np.asarray((np.column_stack([i, j])[inside] + 0.5) * side)
-    return _Grid(centers, side, np.array(means), float(np.mean(per_point)), squares, free)
+    terms: FloatArray = np.column_stack([np.ones(len(centers)), centers / side])
+    off_planes = np.linalg.qr(terms, mode="complete")[0][:, 3:]
+    return _Grid(centers, np.asarray(off_planes), side, np.array(means), float(np.mean(per_point)), squares, free)
 
 
 def _likelihood(grids: Sequence[_Grid], length_m: float) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -236,13 +240,11 @@ def _spectrum(grid: _Grid, length_m: float) -> tuple[FloatArray, FloatArray]:
 
     Cells blur it: the correlation of means in squares of side a is that of points for a length of sqrt(l^2 + a^2 / 3).
     """
-    terms: FloatArray = np.column_stack([np.ones(len(grid.centers_m)), grid.centers_m / grid.side_m])
-    off_planes: FloatArray = np.linalg.qr(terms, mode="complete")[0][:, 3:]
     apart2 = np.sum((grid.centers_m[:, None] - grid.centers_m) ** 2, axis=2)
     wide2 = length_m**2 + grid.side_m**2 / 3
     correlation = _pooled(length_m, grid.side_m) * np.exp(-apart2 / wide2)
-    values, vectors = np.linalg.eigh(np.asarray(off_planes.T @ correlation @ off_planes))
-    seen = grid.means_m @ off_planes @ vectors
+    values, vectors = np.linalg.eigh(np.asarray(grid.off_planes.T @ correlation @ grid.off_planes))
+    seen = grid.means_m @ grid.off_planes @ vectors
     return np.maximum(values, 0.0), np.asarray(np.sum(seen**2, axis=0))
 
 
