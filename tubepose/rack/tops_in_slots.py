@@ -39,8 +39,8 @@ class TopsInSlots:
 
     Attributes:
         count: How many there are.
-        median_share: How far their middles lie from the slots' centres, median, as a share of the distance of slots; NaN
-            without any.
+        median_share: How far their middles lie from the slots' centres, median, as a share of the distance of slots;
+            NaN without any.
         stretch: By how much they lie farther apart than the slots along x and y, shape (2,); 0 where they tell none.
         std: Standard deviations of that, shape (2,); infinite where they tell none.
     """
