@@ -122,7 +122,8 @@ def _fit_flat(
         return tuple(_no_tube(left, standing, rack) for left in unknown)
     measured = measure_tops(frame, intrinsics, T_camera_rack, rack, tubes, config, allowed)
     models = [tubes[k] for k in measured.tops.tube]
-    leftovers = find_leftovers(measured.points, measured.label, measured.tops.slot.tolist(), rack, tubes)
+    taken = [*measured.tops.slot.tolist(), *(left.slot for left in measured.strangers if left.slot is not None)]
+    leftovers = find_leftovers(measured.points, measured.label, taken, rack, tubes)
     posterior = fuse(measured, models, rack, config.profile)
     covariance = pose_covariance(posterior, measured, models, rack, config.profile, rack_covariance)
     rise = _rise_m(measured, models, rack, config.profile)
@@ -135,7 +136,7 @@ def _fit_flat(
         if crowd and pose.status is TubeStatus.OK:
             pose = _rejected(pose, f"two tubes in one slot: {crowd}")
         found.append(ProfileTube(slot.name, tube, float(measured.tops.support[i]), clouds[i], pose))
-    return (*found, *(_no_tube(left, measured.points, rack) for left in leftovers))
+    return (*found, *(_no_tube(left, measured.points, rack) for left in (*measured.strangers, *leftovers)))
 
 
 def _clouds(measured: Measured, count: int) -> list[FloatArray]:

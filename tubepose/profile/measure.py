@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from functools import partial, reduce
 
 import numpy as np
@@ -13,9 +13,11 @@ from tubepose.capture.frame import CameraIntrinsics, RgbdFrame
 from tubepose.config import Config, ProfileConfig
 from tubepose.labware import RackModel, TubeModel
 from tubepose.profile.faint_rims import RimSearch, find_faint_rims
+from tubepose.profile.identity import Names, measured_radii, name_tops, unknown_words
 from tubepose.profile.kernels import cell_values, crowded_ends, ends_on_planes, near_planes, nearest_tops
+from tubepose.profile.leftovers import NO_TOP, STRANGE_TOP, Leftover
 from tubepose.profile.outline import NORMALS, OUTLINE_DEPTH_M, SECTORS, Circles, fit_discs, unknown_circles
-from tubepose.profile.plane import TopPlanes, fit_top_planes, unknown_planes
+from tubepose.profile.plane import TopPlanes, fit_top_planes, top_spacing_m, unknown_planes
 from tubepose.profile.rims import RimView, fit_rims, rim_view
 from tubepose.profile.standing import Standing, gather_standing
 from tubepose.profile.tops import (
@@ -41,6 +43,8 @@ LEAST_WHOLE = 0.75
 LABEL_CELL_M = 5.0e-4
 RING_SUPPORT = 0.6
 """Points with this much support are a rim whatever the image shows."""
+FAR_OFF_M = 4.0e-4
+"""A circle that is so much wider or narrower than its type's is cut off by where its end is looked for."""
 NEAR_TOP_M = 2.5e-3
 """Points this far outside of a top can be of the wall below it."""
 
@@ -55,8 +59,9 @@ class Measured:
         level_m: Height of that circle above the rack's base, shape (T,), metres.
         planes: Planes of closed tops; NaN for open ones.
         circles: Circles of all tops.
-        label: Tube of each point, shape (N,), -1 for none.
+        label: Tube of each point, shape (N,), `NO_TOP` for none, `STRANGE_TOP` for one of no given type.
         points: The points.
+        strangers: Tops of no given type, or of which the type is not known.
     """
 
     tops: Tops
@@ -66,6 +71,7 @@ class Measured:
     circles: Circles
     label: NDArray[np.intp]
     points: Standing
+    strangers: tuple[Leftover, ...] = ()
 
 
 def measure_tops(
@@ -110,14 +116,80 @@ def measure_tops(
             view, tops.take(~torn), rims.take(~torn), standing, rack, tubes, config.profile, allowed
         )
         tops, rims = _with_others(*found, *rest, rack, tubes)
+    return _named(_measured(standing, tops, rims, rack, tubes, config.profile), rims, rack, tubes, config.profile, allowed)
+
+
+def _measured(
+    standing: Standing, tops: Tops, rims: Circles, rack: RackModel, tubes: Sequence[TubeModel], config: ProfileConfig
+) -> Measured:
+    """Planes and circles of tops whose rims are measured."""
     shape = _shapes(tops, tubes, rack)
     label = label_points(standing, tops.center_m, shape.radius_m)
     planes, circles = unknown_planes(len(shape.open)), rims
     if not shape.open.all():
-        planes, discs = _measure_closed(standing, label, tops, shape, config.profile)
+        planes, discs = _measure_closed(standing, label, tops, shape, config)
         circles = discs.where(~shape.open, rims)
     level = np.where(np.isfinite(planes.height_m), planes.height_m, shape.level_m)
     return Measured(tops, tops.center_m + circles.offset_m, level, planes, circles, label, standing)
+
+
+def _named(
+    found: Measured,
+    rims: Circles,
+    rack: RackModel,
+    tubes: Sequence[TubeModel],
+    config: ProfileConfig,
+    allowed: NDArray[np.bool_] | None,
+) -> Measured:
+    """The same tops under the types that they are likeliest to be of; those of no type for sure are strangers."""
+    names, radius_m = _names(found, rack, tubes, config, allowed)
+    shape = _shapes(found.tops, tubes, rack)
+    tube = np.where(shape.open | ~np.isfinite(names.odds), found.tops.tube, names.tube)
+    if np.any(tube != found.tops.tube):
+        found = _measured(found.points, replace(found.tops, tube=tube), rims, rack, tubes, config)
+        names, radius_m = _names(found, rack, tubes, config, allowed)
+    strange = np.flatnonzero(~shape.open & (names.odds < config.min_type_odds))
+    strangers = []
+    for t in strange:
+        rival = tubes[names.rival[t]] if names.rival[t] >= 0 else None
+        words = unknown_words(
+            float(found.level_m[t]), float(radius_m[t]), (tubes[found.tops.tube[t]], rival), float(names.odds[t]), rack,
+            config.min_type_odds,
+        )  # fmt: skip
+        strangers.append(Leftover(int(found.tops.slot[t]), words, np.flatnonzero(found.label == t)))
+    return _without(found, strange, tuple(strangers)) if strangers else found
+
+
+def _names(
+    found: Measured, rack: RackModel, tubes: Sequence[TubeModel], config: ProfileConfig, allowed: NDArray[np.bool_] | None
+) -> tuple[Names, FloatArray]:
+    """Types of all tops, and the radii of their circles, shape (T,), metres."""
+    tops, shape = found.tops, _shapes(found.tops, tubes, rack)
+    circles, radius_m = found.circles, shape.radius_m + found.circles.widening_m
+    if np.any(np.abs(circles.widening_m[~shape.open]) > FAR_OFF_M):
+        # A circle that is far off its radius is measured again where it ends.
+        again = replace(shape, radius_m=np.where(np.isfinite(radius_m), radius_m, shape.radius_m))
+        _, circles = _measure_closed(found.points, found.label, tops, again, config)
+        radius_m = again.radius_m + circles.widening_m
+    radius_m = np.where(np.isfinite(circles.offset_m[:, 0]), radius_m, np.nan)
+    spacing_m = top_spacing_m(found.planes, shape.radius_m)
+    may = np.array([not tube.is_open for tube in tubes])[None] & ~shape.open[:, None]
+    if allowed is not None:
+        may = may & allowed[:, tops.slot].T
+    radii = measured_radii(radius_m, circles.covariance_m2, spacing_m)
+    return name_tops(found.planes.height_m, radii, may, rack, tubes, config), radius_m
+
+
+def _without(found: Measured, strange: NDArray[np.intp], strangers: tuple[Leftover, ...]) -> Measured:
+    """The same without some tops, whose points are of strangers."""
+    kept = np.setdiff1d(np.arange(len(found.level_m)), strange)
+    number = np.full(len(found.level_m) + 1, NO_TOP)
+    number[kept], number[strange] = np.arange(len(kept)), STRANGE_TOP
+    planes = TopPlanes(*(getattr(found.planes, field.name)[kept] for field in fields(TopPlanes)))
+    return Measured(
+        found.tops.take(kept), found.center_m[kept], found.level_m[kept], planes, found.circles.take(kept),
+        number[found.label], found.points, strangers,
+    )  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True, eq=False)
