@@ -265,7 +265,8 @@ def _with_faint_rims(
 ) -> tuple[Tops, Circles]:
     """The same tops and circles, and those of open types that the image alone shows in the slots that are left."""
     free = np.setdiff1d(np.arange(len(rack.all_slots)), tops.slot)
-    types = np.array([k for k, tube in enumerate(tubes) if tube.is_open], np.intp)
+    # An opaque rim returns points: what the image alone shows is none.
+    types = np.array([k for k, tube in enumerate(tubes) if tube.is_open and not _is_opaque(tube)], np.intp)
     if len(free) == 0 or len(types) == 0:
         return tops, rims
     known = (tops.center_m, np.array([top_radius_m(tubes[k]) for k in tops.tube]))
@@ -293,6 +294,11 @@ def _with_faint_rims(
     circles = [one.circles.take(at) for one in seen]
     found = reduce(lambda low, k: circles[k].where(best[at] == k, low), range(1, len(types)), circles[0])
     return joined(tops, new), joined(rims, found)
+
+
+def _is_opaque(tube: TubeModel) -> bool:
+    """Whether light does not enter an open tube's rim."""
+    return (tube.body if tube.cap is None else tube.cap).material == "opaque"
 
 
 def _holes_m(rack: RackModel, standing: Standing, level_m: float) -> FloatArray:
