@@ -169,7 +169,8 @@ def foreign_center_m(cloud_m: FloatArray) -> FloatArray | None:
     v, u = np.nonzero(np.isfinite(some).all(axis=-1))
     if len(u) < _MIN_POINTS:
         return None
-    points, pixels = some[v, u], np.column_stack([u, v]) * float(step)
+    points: FloatArray = some[v, u]
+    pixels = np.asarray(np.column_stack([u, v]) * float(step), float)
     _, here_px = _fit_projection(points, pixels)
     if here_px <= _MAX_RESIDUAL_PX:
         return None

@@ -13,10 +13,11 @@ from tubepose.config import Config, ProfileConfig
 from tubepose.labware import RackModel, TubeModel
 from tubepose.preprocessing import TALLEST_TUBE_M
 from tubepose.profile.bowed import FaceBow, SlotFrame, in_rack_frame, slot_frame
+from tubepose.profile.closed_tops import Measured
 from tubepose.profile.floor import SETTLED_MM, settle_floor
 from tubepose.profile.kernels import grouped
 from tubepose.profile.leftovers import Leftover, find_leftovers
-from tubepose.profile.measure import Measured, measure_tops
+from tubepose.profile.measure import measure_tops
 from tubepose.profile.plane import top_spacing_m
 from tubepose.profile.posterior import FEW_SAMPLES, Evidence, Posterior, combine, evidence, per_model
 from tubepose.profile.standing import Standing, gather_standing

@@ -108,9 +108,7 @@ def name_tops(
     return _best(np.where(may, pooled, -np.inf), other)
 
 
-def _by_radius(
-    wider_m: FloatArray, radii: Radii, sure: NDArray[np.bool_], config: ProfileConfig
-) -> FloatArray:
+def _by_radius(wider_m: FloatArray, radii: Radii, sure: NDArray[np.bool_], config: ProfileConfig) -> FloatArray:
     """Log likelihood of radii more than a type's (T, K), given those of the tops that are `sure` (T, K) to be of a type.
 
     Where points end is the sensor's, one offset for all tops: what the other types' tops say of it is known. With the
@@ -129,7 +127,9 @@ def _by_radius(
     # A median of few is no better than one of them.
     mates = np.where(count > 1, np.minimum(count - 1, MOST_MATES) / fit2 if fit2 > 0 else 0.0, 0.0)
     spread2 = 1 / (1 / common2 + mates)
-    value = _gauss(wider_m - spread2 * (expected / common2 + mates * middle), np.sqrt(spread2 + radii.fit_std_m[:, None] ** 2))
+    value = _gauss(
+        wider_m - spread2 * (expected / common2 + mates * middle), np.sqrt(spread2 + radii.fit_std_m[:, None] ** 2)
+    )
     beyond = (count > 1) & (np.abs(middle - expected) > CONTRADICTS * np.sqrt(common2 + fit2 / np.maximum(count, 1)))
     return np.where(beyond & np.isfinite(wider_m), -np.inf, value)
 
@@ -147,9 +147,7 @@ def _best(likelihood: FloatArray, other: FloatArray) -> Names:
     return Names(best.astype(np.intp), odds, rival.astype(np.intp))
 
 
-def _by_height(
-    off_m: FloatArray, sure: NDArray[np.bool_], floor_m: float, config: ProfileConfig
-) -> FloatArray:
+def _by_height(off_m: FloatArray, sure: NDArray[np.bool_], floor_m: float, config: ProfileConfig) -> FloatArray:
     """Log likelihood of heights off a type's (T, K), given those of the other tubes that are `sure` (T, K) to be of it.
 
     The common offset of a type has a mixture of two Gaussians as its prior; each top scatters about it by its seat.
@@ -176,7 +174,12 @@ def _gauss(off: FloatArray, std: FloatArray) -> FloatArray:
 
 
 def unknown_words(
-    height_m: float, radius_m: float, names: tuple[TubeModel, TubeModel | None], odds: float, rack: RackModel, least: float
+    height_m: float,
+    radius_m: float,
+    names: tuple[TubeModel, TubeModel | None],
+    odds: float,
+    rack: RackModel,
+    least: float,
 ) -> str:
     """Why a top is of no given type for sure, in words.
 
