@@ -103,10 +103,13 @@ def name_measured(
     """The same tops under the types that they are likeliest to be of; those of no type for sure are strangers."""
     names, radius_m = _names(found, rack, tubes, config, allowed)
     shape = top_shapes(found.tops, tubes, rack)
-    tube = np.where(shape.open | ~np.isfinite(names.odds), found.tops.tube, names.tube)
+    tube = np.where(names.odds >= config.min_type_odds, names.tube, found.tops.tube)
     if np.any(tube != found.tops.tube):
         found = measure_closed_tops(found.points, replace(found.tops, tube=tube), rims, rack, tubes, config)
         names, radius_m = _names(found, rack, tubes, config, allowed)
+    # How well another type would cover the points is no question where its height and its radius were measured.
+    runner_up = np.where(shape.open, found.tops.runner_up, -np.inf)
+    found = replace(found, tops=replace(found.tops, runner_up=runner_up))
     strange = np.flatnonzero(~shape.open & (names.odds < config.min_type_odds))
     strangers = []
     for t in strange:

@@ -29,6 +29,8 @@ LEAST_ENDS_M = 5.0e-5
 """Edges of caps are rounded: a finer scan does not know better where they end."""
 MOST_MATES = 4
 """A median of a type's radii tells as much as so many of them: some may be of another type."""
+TELLS = 2.0
+"""Radii within so many standard deviations of a type's tell its common offset."""
 CONTRADICTS = 3.0
 """Standard deviations of a type's common radius beyond which its tops are of another type."""
 
@@ -116,6 +118,8 @@ def _by_radius(wider_m: FloatArray, radii: Radii, sure: NDArray[np.bool_], confi
     """
     ends2 = radii.ends_std_m**2
     fit2 = float(np.median(radii.fit_std_m**2)) if len(radii.fit_std_m) else 0.0
+    # What is far off may be of another type, and tells nothing of this one's.
+    sure = sure & (np.abs(wider_m) < TELLS * np.sqrt(ends2 + config.cap_radius_m**2 + fit2))
     count = sure.sum(axis=0)
     middle = np.array([np.median(wider_m[sure[:, k], k]) if count[k] else 0.0 for k in range(len(count))])
     one2 = config.cap_radius_m**2 + fit2 / np.maximum(count, 1)
