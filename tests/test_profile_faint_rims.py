@@ -7,8 +7,9 @@ from test_profile_rims import CAMERA, INNER_M, LEVEL_M, OUTER_M, RACK, VIEW, dra
 from tubepose.config import Config, ProfileConfig
 from tubepose.labware import load_tube
 from tubepose.profile import fit_profiles
+from tubepose.profile.closed_tops import blocked_sectors
 from tubepose.profile.faint_rims import RimSearch, find_faint_rims
-from tubepose.profile.measure import blocked_sectors, measure_tops
+from tubepose.profile.measure import measure_tops
 from tubepose.profile.outline import SECTORS
 from tubepose.profile.standing import Standing
 from tubepose.profile.tops import mouth_radius_m, top_radius_m

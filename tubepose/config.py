@@ -286,6 +286,9 @@ class ProfileConfig(_Section):
         wall_redundancy: How many neighbouring points of a wall count as one: they share their error.
         min_wall_points: Fewer points near a wall's radius say nothing.
         cap_height_m: Standard deviation of the height at which a cap sits, with the scanner's own error.
+        cap_radius_m: Standard deviation of a cap's radius about its definition: moulded caps hold 0.1 mm.
+        type_height_m: Standard deviation of what a type's height is off in a file that is not right; measured by a ruler.
+        min_type_odds: Least log odds (nats) of a top's type against every other given one and another type: 99 to 1.
         cap_tilt_rad: Standard deviation of how crooked a cap sits, about each of two axes.
         slope_std: Width of the proposal in the slope of the axis; wider than any slot allows.
         slot_tolerance_m: How soft the walls of the slot and the edge of its floor's play are.
@@ -318,6 +321,9 @@ class ProfileConfig(_Section):
     lone_rim_m: float = 8.0e-4
     torn_rim_m: float = 6.0e-4
     cap_height_m: float = Field(default=3.0e-4, gt=0)
+    cap_radius_m: float = Field(default=1.0e-4, gt=0)
+    type_height_m: float = Field(default=1.0e-3, gt=0)
+    min_type_odds: float = 4.6
     cap_tilt_rad: float = 0.0030
     wall_noise_m: float = Field(default=1.5e-4, gt=0)
     wall_radius_m: float = Field(default=1.0e-4, gt=0)

@@ -9,8 +9,8 @@ import numpy as np
 
 from tubepose.config import Config, ProfileConfig
 from tubepose.labware import RackModel, TubeModel
+from tubepose.profile.closed_tops import ON_PLANE_SHARE, Measured
 from tubepose.profile.kernels import grouped
-from tubepose.profile.measure import ON_PLANE_SHARE, Measured
 from tubepose.profile.plane import EDGE_M
 from tubepose.profile.posterior import per_model
 from tubepose.profile.tops import top_radius_m
