@@ -145,8 +145,8 @@ def refuse_foreign_frame(frame: RgbdFrame) -> None:
         x, y, z = (f"{value:.2f}" for value in center_m)
         raise CaptureError(
             f"frame {frame.index}: the cloud is not in the camera's frame: the lines of sight of its pixels meet at "
-            f"({x}, {y}, {z}) m; expected at the origin, with x to the right of the image, y down and z forward: export it "
-            "in the camera's coordinate space, without a transformation to a robot or a marker"
+            f"({x}, {y}, {z}) m; expected at the origin, with x to the right of the image, y down and z forward: "
+            "export it in the camera's coordinate space, without a transformation to a robot or a marker"
         )
 
 
