@@ -23,11 +23,11 @@ _MIN_POINTS = 100
 MIRROR_PIXELS = 4000
 """So many pixels, evenly spread, tell a mirrored cloud."""
 _MOVED_SHARE = 0.5
-"""A centre elsewhere has to leave this share, or less, of what lines of sight from the origin leave: a lens's distortion,
-which no centre explains, is not taken for a cloud that was moved."""
+"""A centre elsewhere has to leave this share, or less, of what lines of sight from the origin leave: a lens's
+distortion, which no centre explains, is not taken for a cloud that was moved."""
 _LENS_SHARE = 0.01
-"""RMS residual of a pinhole fit to a camera with a usual lens's distortion, as a share of the image's longer side; clouds
-whose pixels are in no order leave a quarter."""
+"""RMS residual of a pinhole fit to a camera with a usual lens's distortion, as a share of the image's longer side;
+clouds whose pixels are in no order leave a quarter."""
 FARTHEST_M = 1e4
 """No sensor of racks sees as far: numbers like this mark a missing point."""
 
@@ -135,7 +135,7 @@ def refuse_mirrored(frame: RgbdFrame) -> None:
 
 
 def refuse_foreign_frame(frame: RgbdFrame) -> None:
-    """Say so where a frame's organised cloud is not in its camera's frame, a robot's say: lines of sight start elsewhere.
+    """Say so where a frame's organised cloud is not in its camera's frame but in another one, a robot's say.
 
     Raises:
         CaptureError: The lines of sight of its pixels meet in a point that is not the origin.
@@ -144,17 +144,17 @@ def refuse_foreign_frame(frame: RgbdFrame) -> None:
     if center_m is not None:
         x, y, z = (f"{value:.2f}" for value in center_m)
         raise CaptureError(
-            f"frame {frame.index}: the cloud is not in the camera's frame: the lines of sight of its pixels meet at ({x}, {y}, "
-            f"{z}) m; expected at the origin, with x to the right of the image, y down and z forward: export it in the "
-            "camera's coordinate space, without a transformation to a robot or a marker"
+            f"frame {frame.index}: the cloud is not in the camera's frame: the lines of sight of its pixels meet at "
+            f"({x}, {y}, {z}) m; expected at the origin, with x to the right of the image, y down and z forward: "
+            "export it in the camera's coordinate space, without a transformation to a robot or a marker"
         )
 
 
 def foreign_center_m(cloud_m: FloatArray) -> FloatArray | None:
     """Where the lines of sight of an organised cloud meet, if that is not the origin: direct linear transformation.
 
-    A pinhole camera at the origin maps points to pixels by a matrix (3, 3), wherever its axes point; one that is anywhere
-    by a matrix (3, 4), whose null space is its centre (Hartley and Zisserman, sections 6.2 and 7.1). Some pixels are
+    A pinhole camera at the origin maps points to pixels by a matrix (3, 3), wherever its axes point; one elsewhere by
+    a matrix (3, 4), whose null space is its centre (Hartley and Zisserman, sections 6.2 and 7.1). Some pixels are
     looked at. Points of one plane fit both, so that nothing is told by them.
 
     Args:
@@ -187,7 +187,7 @@ def foreign_center_m(cloud_m: FloatArray) -> FloatArray | None:
 
 
 def _fit_projection(points: FloatArray, pixels: FloatArray) -> tuple[FloatArray, float]:
-    """The matrix (3, K) that maps points (N, K) to pixels (N, 2) with least algebraic error; its RMS residual, pixels."""
+    """Matrix (3, K) that maps points (N, K) to pixels (N, 2) with least algebraic error; its RMS residual, pixels."""
     size = float(np.abs(pixels).max()) or 1.0
     scaled = pixels / size - 0.5
     zero = np.zeros_like(points)

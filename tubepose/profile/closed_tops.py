@@ -73,9 +73,9 @@ class TopShapes:
 
 
 def top_shapes(tops: Tops, tubes: Sequence[TubeModel], rack: RackModel) -> TopShapes:
-    of_type = np.array([[top_radius_m(t), mouth_radius_m(t), top_level_m(t, rack), t.is_open] for t in tubes])[
-        tops.tube
-    ]
+    """What the definitions of their types say of tops."""
+    of_type = np.array([[top_radius_m(t), mouth_radius_m(t), top_level_m(t, rack), t.is_open] for t in tubes])
+    of_type = of_type[tops.tube]
     return TopShapes(of_type[:, 0], of_type[:, 1], of_type[:, 2], of_type[:, 3] > 0)
 
 

@@ -59,8 +59,8 @@ ONE_HEIGHT_SHARE, ALL_AROUND = 0.6, 0.6
 """Points on a ring are at one height where three bins hold this share of them, in this share of its sectors."""
 
 LEAST_MATES, MATES_POINTS, BARE_SHARE = 2, 30.0, 0.1
-"""So many rims of a type tell how many points one returns, if that is enough to be sure; with less than this share of it
-a ring is none: an even law of 30 points gives 3 or fewer once in 10^8."""
+"""So many rims of a type tell how many points one returns, if that is enough to be sure; with less than this share of
+it a ring is none: a Poisson law of 30 points gives 3 or fewer once in 10^9."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -1,8 +1,9 @@
 """Of which type a measured top is: each given type against the others, and against a tube of another type.
 
-What is measured of a closed top, its height and its radius, has a likelihood under each given type (a Gaussian about its
-definition), and under "another type", which may have any height and any radius (uniform). The heights of a type's tubes in
-a frame have one offset in common, of its definition and of the floor, which the others of them tell.
+What is measured of a closed top, its height and its radius, has a likelihood under each given type (a Gaussian about
+its definition), and under "another type", which may have any height and any radius (uniform). The heights of a type's
+tubes in a frame have one offset in common, of its definition and of the floor, which the others of them tell; radii
+have one of the sensor and one of the cap.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ OTHER_HEIGHTS_M, OTHER_RADII_M = 0.1, 0.012
 TIGHT_M, TIGHT_SHARE = 3.0e-4, 0.9
 """Nine files of ten describe a type's height as well as its caps sit; the tenth is off by `type_height_m`."""
 ENDS_BETWEEN = float(np.sqrt(12.0))
-"""A top's end lies evenly between two points: a spacing over this is the standard deviation of an edge that they share."""
+"""A top's end lies evenly between two points: a spacing over this is its standard deviation."""
 
 LEAST_ENDS_M = 5.0e-5
 """Edges of caps are rounded: a finer scan does not know better where they end."""
@@ -111,7 +112,7 @@ def name_tops(
 
 
 def _by_radius(wider_m: FloatArray, radii: Radii, sure: NDArray[np.bool_], config: ProfileConfig) -> FloatArray:
-    """Log likelihood of radii more than a type's (T, K), given those of the tops that are `sure` (T, K) to be of a type.
+    """Log likelihood of radii off a type's (T, K), given those of the tops that are `sure` (T, K) to be of a type.
 
     Where points end is the sensor's, one offset for all tops: what the other types' tops say of it is known. With the
     cap's tolerance it is a type's common offset, which the median of its own tops tells, wrong ones among them.
@@ -196,8 +197,11 @@ def unknown_words(
         least: Log odds that are expected.
     """
     best, rival = names
-    high_mm, wide_mm = 1e3 * (height_m - rack.floor_m), 2e3 * radius_m
-    found = f"its top is {high_mm:.1f} mm high and {wide_mm:.1f} mm wide, that of {best.name} {best.height_mm:g} and "
+    high_mm, wide = (
+        1e3 * (height_m - rack.floor_m),
+        f"{2e3 * radius_m:.1f} mm" if np.isfinite(radius_m) else "not known to be",
+    )
+    found = f"its top is {high_mm:.1f} mm high and {wide} wide, that of {best.name} {best.height_mm:g} and "
     found += f"{2e3 * top_radius_m(best):.1f} mm (log odds {odds:.1f}, at least {least:g} expected)"
     if rival is None:
         return f"unknown type: {found}; or it stands on something"

@@ -12,8 +12,8 @@ from tubepose.preprocessing import thin
 from tubepose.rack.field import top_field
 from tubepose.transforms import FloatArray, invert_transform, transform_points
 
-# Beyond this angle off its normal a face is foreshortened to a third: its openings close, and no sensor of this kind sees
-# its ribs. A robot's base stands about as high as the rack, and sees its face from the side or from below.
+# Beyond this angle off its normal a face is foreshortened to a third: its openings close, and no sensor of this kind
+# sees its ribs. A robot's base stands about as high as the rack, and sees its face from the side or from below.
 MOST_INCIDENCE_DEG = 70.0
 # Points so far behind the face are of nothing that is bowed (2.5 mm) or noisy there.
 BEHIND_M = 4e-3
@@ -21,8 +21,8 @@ BEHIND_M = 4e-3
 INSIDE_M = 1.5e-3
 # Fewer points behind the face, or a smaller share of the face that deep in the solid part, decide nothing.
 LEAST_BEHIND, LEAST_SOLID = 200, 0.03
-# Were the face not there, as many lines of sight would cross the solid part as its share of the area (100 %). A face that
-# stops them lets hardly one pass: ghosts and light through its material. Half tells them apart.
+# Were the face not there, as many lines of sight would cross the solid part as its share of the area (100 %). A face
+# that stops them lets hardly one pass: ghosts and light through its material. Half tells them apart.
 MOST_THROUGH_PERCENT = 50.0
 # The table around a rack lies below its face, by the rack's height; above it, as near to that as this, the rack is seen
 # from below. Most of what lies around it has to say so.
@@ -54,7 +54,7 @@ def viewpoint_checks(points_m: FloatArray, T_camera_rack: FloatArray, rack: Rack
 
 
 def _through(local_m: FloatArray, origin_m: FloatArray, rack: RackModel) -> Iterator[Check]:
-    """Lines of sight that end behind the face and cross its solid part, as a share of what they would without a face."""
+    """Lines of sight behind the face that cross its solid part, as a share of those that would without a face."""
     behind = local_m[local_m[:, 2] < rack.height_m - BEHIND_M]
     share = (rack.height_m - origin_m[2]) / (behind[:, 2] - origin_m[2])
     crossing_m = origin_m[:2] + (behind[:, :2] - origin_m[:2]) * share[:, None]
