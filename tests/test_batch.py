@@ -354,7 +354,7 @@ def test_captures_after_the_first_stand_as_it_did(place: SlotHint) -> None:
     tables = run(*jobs)
     assert resolved(tables) == ["hint", "previous"]
     assert not any(row["ambiguous"] for rows in (tables.racks, tables.slots, tables.estimates) for row in rows)
-    filled = [row["slot"] for row in tables.slots if row["occupied"]]
+    filled = [row["slot"] for row in tables.slots if row["state"] == "occupied"]
     assert filled == (["B2"] if place is A1 else ["B3"]) * 2
 
 
