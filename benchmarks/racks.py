@@ -224,10 +224,10 @@ def scan_table(file: Path, rack: RackModel, starts: int) -> None:
     points = next(iter(open_captures(file, unit="m")[0].frames())).points_m
     points = points[np.isfinite(points[:, 2])]
     pose, ranking = name_rack(points, Config())
-    told = ", ".join(f"{e.rack.name} {e.evidence:.0f} nats{' (refused)' if e.reason else ''}" for e in ranking)
+    told = ", ".join(f"{e.rack.name} {e.log_likelihood:.0f} nats{' (refused)' if e.reason else ''}" for e in ranking)
     name = pose.rack.name if pose.rack is not None else pose.reason
-    print(f"{len(points)} points; named: {name}, margin {pose.named_by_margin:.2f}")
-    print(f"evidence: {told}")
+    print(f"{len(points)} points; named: {name}, ahead by {pose.named_by_nats:.0f} nats")
+    print(f"log likelihoods: {told}")
     rng = np.random.default_rng(0)
     for drop in (0.0, 0.5):
         found = [_repeat(points[rng.random(len(points)) >= drop], rack, rng) for _ in range(starts)]

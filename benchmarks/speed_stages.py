@@ -13,7 +13,7 @@ from unittest.mock import patch
 import numpy as np
 
 from tubepose.pipeline import Scene, TubeEstimate
-from tubepose.profile import estimate, measure
+from tubepose.profile import estimate, fusing, measure
 from tubepose.transforms import transform_points
 
 STAGES: dict[str, tuple[ModuleType, tuple[str, ...]]] = {
@@ -25,8 +25,9 @@ STAGES: dict[str, tuple[ModuleType, tuple[str, ...]]] = {
     "rims": (measure, ("fit_rims",)),
     "faint rims": (measure, ("find_faint_rims",)),
     "leftovers": (estimate, ("find_leftovers",)),
-    "posterior": (estimate, ("top_evidence", "combine", "pose_covariance")),
-    "walls": (estimate, ("wall_evidence",)),
+    "posterior": (fusing, ("top_evidence", "combine")),
+    "walls": (fusing, ("wall_evidence",)),
+    "covariance": (estimate, ("believed", "pose_covariance")),
 }
 """Stages of `profile` by the public functions that make them up, and the modules that call them."""
 REST = "rest"

@@ -210,8 +210,9 @@ def _rack_words(row: Row, tables: Tables) -> str:
         if row["ambiguous"]:
             settle = row["hint_note"] or _hint_words(row, tables)
             turn = f", may stand another way round (slot names may be swapped; {settle})"
-        margin = row["named_by_margin"]
-        named = f" (named by a margin of {margin:.0%})" if not math.isnan(margin) else ""
+        nats = row["named_by_nats"]
+        ahead = "no other fits" if math.isinf(nats) else f"likelier than the next one by {nats:.0f} nats"
+        named = "" if math.isnan(nats) else f" (named: {ahead})"
         words = f"ok{named}, inlier rmse {row['inlier_rmse_m'] * 1e3:.2f} mm{turn}"
     else:
         look = "; --rack auto tells which of the catalogue's it is" if row["status"] in ("refused", "not_found") else ""

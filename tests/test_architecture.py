@@ -32,7 +32,7 @@ ALLOWED: dict[str, set[str]] = {
     "rack": {"capture", "checks", "compiled", "config", "labware", "preprocessing"},
     "slots": {"capture", "checks", "compiled", "config", "labware", "preprocessing", "detection", "rack"},
     "tube": {"checks", "config", "labware", "preprocessing", "slots"},
-    "profile": {"capture", "checks", "compiled", "confidence", "config", "labware", "preprocessing", "tube"},
+    "profile": {"capture", "checks", "compiled", "confidence", "config", "labware", "preprocessing", "sensor", "tube"},
     "baselines": {"checks", "config", "labware", "preprocessing", "slots", "tube"},
     "rivals": {"config", "labware", "tube", "baselines"},
     "scene": {"capture", "checks", "detection", "labware", "rack", "sensor", "slots", "stage_times", "tube"},

@@ -284,7 +284,7 @@ def unnamed(name: str, *frames: RgbdFrame, nameable: tuple[int, ...] = (), **mor
 
     def find(frame: RgbdFrame) -> RackPose:
         if frame.index in nameable:
-            return RackPose(RackStatus.OK, "", T_CAMERA_RACK, rack=RACK, named_by_margin=0.75)
+            return RackPose(RackStatus.OK, "", T_CAMERA_RACK, rack=RACK, named_by_nats=0.75)
         return RackPose(RackStatus.REFUSED, f"no rack fits in {frame.index}")
 
     return UnnamedJob(Recorded(name, frames), find, (TUBE,), **more)
@@ -300,7 +300,7 @@ def test_a_rack_is_asked_for_until_it_is_named_and_frames_before_have_their_rows
         *((frame, method, RACK.name, "ok", "") for frame in (1, 2) for method in ("upright", "slot-icp")),
     ]
     assert {(row["session"], row["trial"]) for row in tables.racks} == {("s", "t")}
-    assert {row.get("named_by_margin") for row in tables.racks} == {None, 0.75}
+    assert {row.get("named_by_nats") for row in tables.racks} == {None, 0.75}
     assert set(tables.labware) == {RACK.name, TUBE.name}
     assert list(to_table(tables.racks, RACK_COLUMNS)["tx_m"].isna()) == [True, True, False, False, False, False]
 

@@ -84,7 +84,7 @@ def test_numbers_that_would_open_a_gate_or_break_a_fit_are_refused(tmp_path, tex
         load_config(tmp_path / "a.yaml")
 
 
-@pytest.mark.parametrize("text", ["rack: {min_seen: 0}", "slots: {open_depth_m: 0}", "profile: {shared_error_m: 0}"])
+@pytest.mark.parametrize("text", ["rack: {min_seen: 0}", "slots: {open_depth_m: 0}", "sensor: {shared_m: 0}"])
 def test_nothing_is_a_number_too(tmp_path, text):
     (tmp_path / "a.yaml").write_text(text, encoding="utf-8")
     (tmp_path / "b.yaml").write_text(text.replace("0", "0.5"), encoding="utf-8")

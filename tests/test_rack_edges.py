@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import scenes
 
+from tubepose.checks import Check
 from tubepose.config import Config
 from tubepose.labware import RackModel, load_rack, load_tube
 from tubepose.rack import RackStatus, agreement, edges, fit, looks, register_rack, settling
@@ -184,10 +185,11 @@ def test_a_place_with_much_less_evidence_than_an_accepted_one_is_not_refined(eve
         T = T_TRUE @ translation([shift_m, 0.0, 0.0])
         return edges._no_rival(*looks.look_at(points[::every], T, SOFT), every, found, SOFT, CONFIG.rack)
 
+    refused = replace(best, checks=(Check("row_more", 90.0, 60.0, False),))
     half_a_rack = 5 * SOFT.grid.pitch_mm[0] * 1e-3
     assert no_rival(half_a_rack, [best])
     assert not no_rival(0.0, [best])
-    assert not no_rival(half_a_rack, [replace(best, reason="another rack?")])  # nothing is accepted yet
+    assert not no_rival(half_a_rack, [refused])  # nothing is accepted yet
     assert not no_rival(half_a_rack, [])
 
 

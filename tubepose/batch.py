@@ -44,7 +44,7 @@ class Job:
         session: Name of its session, or empty.
         trial: Name of its trial, or empty.
         T_camera_rack: The rack's pose where it is known and not to be estimated, shape (4, 4), metres; else None.
-        named_by_margin: By how much the rack was ahead of the catalogue's next one; NaN where a person named it.
+        named_by_nats: By how much the rack was ahead of the catalogue's next one; NaN where a person named it.
         previous: Whether a rack that was left alone since an earlier frame of the session stands as it did there.
     """
 
@@ -55,7 +55,7 @@ class Job:
     session: str = ""
     trial: str = ""
     T_camera_rack: FloatArray | None = None
-    named_by_margin: float = float("nan")
+    named_by_nats: float = float("nan")
     previous: bool = False
 
 
@@ -262,7 +262,7 @@ def _named_frames(
                     break
                 continue
             named = Job(
-                job.capture, pose.rack, job.tubes, job.hint, job.session, job.trial, None, pose.named_by_margin,
+                job.capture, pose.rack, job.tubes, job.hint, job.session, job.trial, None, pose.named_by_nats,
                 job.previous,
             )  # fmt: skip
         assert named is not None
@@ -329,9 +329,7 @@ def _run_frame(
             if method == shown_method and seed in (None, 0):
                 shown, shown_scene = estimates, judged
             if seed in (None, 0):
-                tables.racks.append(
-                    {**keys, "method": method, **rack_row(judged), "named_by_margin": job.named_by_margin}
-                )
+                tables.racks.append({**keys, "method": method, **rack_row(judged), "named_by_nats": job.named_by_nats})
                 tables.slots += slot_rows(keys, method, judged, estimates)
                 tables.checks += check_rows(keys, method, judged, estimates)
     of_profile = shown if shown_method == DEFAULT_METHOD else ()

@@ -119,8 +119,8 @@ class RackConfig(_Section):
         max_scale: Largest difference of scale, as a share, of everything that is seen of the rack.
         max_scale_shift_mm: A difference of scale that moves the rack by more along the line of sight is marked.
         edge_std_mm: How far a sensor's blur and a projector's shadow move the edge of an outline.
-        max_tops_off: How far the tops of what stands in the slots may lie from the slots' centres, root of the mean square
-            as a share of the distance of slots: tubes lean by less than a tenth, and tops anywhere give 0.38.
+        max_tops_off: How far the tops of what stands in the slots may lie from the slots' centres, median, as a share of
+            the distance of slots: tubes lean by a tenth, and tops anywhere give 0.4.
         max_bow_mm: Largest bow of a face, at the ends of its outline (two of two real racks: 0.7 to 2 mm).
         max_floor_mm: How far the slots' floor may be seen from where the file has it, beside three standard deviations.
         min_seen: Smallest share of the template that is seen: a rack full of caps shows 5 to 24 %.
@@ -183,8 +183,8 @@ class SensorConfig(_Section):
 
     Attributes:
         independent_m: Prior: standard deviation of a point's own error (ribs of REAL PhoXi scans: 0.07 to 0.08 mm).
-        shared_m: Prior: standard deviation of the error that neighbours share (as `ProfileConfig.shared_error_m`; on
-            the ribs of the same REAL scans it is up to 0.15 mm).
+        shared_m: Prior: standard deviation of the error that neighbours share (SIMULATED structured light; up to 0.15
+            mm on the ribs of the same REAL scans).
         correlation_m: Prior: distance at which the shared error's correlation is 1/e (2 to 3 mm on those ribs).
         spacing_m: Prior: distance of neighbouring points (REAL PhoXi M: 0.4 mm at 0.65 m).
         distance_m: Prior: depth at which these hold (that scanner's working distance).
@@ -272,8 +272,7 @@ class ProfileConfig(_Section):
         reach_m: Added to what a slot lets a tube's top reach, for the rack's error and for looser slots.
         plane_points: Points of a top that its plane is fitted to.
         min_top_points: Fewer points than this make no plane.
-        shared_error_m: Depth error that neighbouring points share, standard deviation.
-        shared_error_reach_m: How far it is shared.
+        edge_ramp_m: Width of the ramp that the end of a top is, beyond that of today's scanner: set frame by frame.
         outline_noise_m: Standard deviation of the radius at which a sector of a top ends.
         outline_bias_m: Standard deviation of a circle's middle beyond what its sectors explain.
         rim_noise_m: As `outline_noise_m`, of the bright ring of a rim.
@@ -292,7 +291,8 @@ class ProfileConfig(_Section):
         slot_tolerance_m: How soft the walls of the slot and the edge of its floor's play are.
         min_allowed: Least share of what the measurements leave open that the slot must allow.
         max_runner_up: A type whose top another one fits with this share of its support is not told apart.
-        max_height_error_m: A closed top farther off its height than this is rejected.
+        max_height_error_m: A closed top farther off its height than this is rejected: four times `cap_height_m`. It
+            grows with the noise of heights as that standard deviation does.
         max_tilt_std_rad: A tilt that is not known better than this is rejected.
         widening_m: Standard deviation of a circle's apparent radius, and of how elliptic it looks.
     """
@@ -307,8 +307,7 @@ class ProfileConfig(_Section):
     reach_m: float = 1.5e-3
     plane_points: int = 400
     min_top_points: int = 30
-    shared_error_m: float = 2.0e-5
-    shared_error_reach_m: float = Field(default=3.0e-3, gt=0)
+    edge_ramp_m: float = 0.0
     outline_noise_m: float = 1.7e-4
     outline_bias_m: float = 9.0e-5
     widening_m: float = Field(default=3.0e-4, gt=0)

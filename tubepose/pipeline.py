@@ -156,6 +156,7 @@ def _profile_estimates(scene: Scene, config: Config) -> tuple[tuple[TubeEstimate
         rack_covariance=scene.rack_pose.covariance,
         allowed=allowed_types(scene),
         bow=_bow(scene.rack_pose),
+        noise=scene.noise,
     )
     share_ms = (time.perf_counter_ns() - start) / 1e6 / max(len(found), 1)
     targets = [(_profile_target(tube), tube.pose) for tube in found]

@@ -30,7 +30,7 @@ RACK_COLUMNS = (
     "marks", "ambiguous",
     "resolved_by", "hint_note", "turn_margin_m", "inlier_rmse_m", "fitness", "in_slot_share", "coverage", "spacing_m",
     "level_tops", "n_racks_detected", "n_tubes_detected", "box_source", "box_score", "box_note", *POSE_COLUMNS,
-    "named_by_margin", *RACK_COVARIANCE_COLUMNS,
+    "named_by_nats", *RACK_COVARIANCE_COLUMNS,
 )  # fmt: skip
 SENSOR_COLUMNS = (
     "session", "trial", "capture", "frame", "timestamp_ns", "source", "independent_m", "independent_relative_std",

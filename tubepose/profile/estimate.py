@@ -16,15 +16,19 @@ from tubepose.labware import RackModel, TubeModel
 from tubepose.preprocessing import TALLEST_TUBE_M
 from tubepose.profile.bowed import FaceBow, SlotFrame, in_rack_frame, slot_frame
 from tubepose.profile.floor import SETTLED_MM, settle_floor
+from tubepose.profile.fusing import fuse, pose_covariance, rise_m
 from tubepose.profile.kernels import grouped
 from tubepose.profile.leftovers import Leftover, find_leftovers
 from tubepose.profile.measure import Measured, measure_tops
 from tubepose.profile.plane import top_spacing_m
-from tubepose.profile.posterior import FEW_SAMPLES, Evidence, Posterior, combine, evidence, per_model
+from tubepose.profile.posterior import Posterior, per_model
 from tubepose.profile.standing import Standing, gather_standing
+from tubepose.profile.top_noise import TopNoise, believed, cap_discs, height_limit_m, noisy_config, wall_noise
 from tubepose.profile.tops import top_radius_m
 from tubepose.profile.verdict import p_type, tube_checks
-from tubepose.profile.wall import wall_evidence
+from tubepose.sensor import SensorNoise, prior_noise
+from tubepose.sensor.caps import CapDisc, seen_on_caps
+from tubepose.sensor.noise import PRIOR, RACK_TOP
 from tubepose.transforms import FloatArray, axis_rotations, transform_points
 from tubepose.tube import TopMeasure, TubePose, TubeStatus
 
@@ -48,6 +52,34 @@ class ProfileTube:
     pose: TubePose
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class ProfileFit:
+    """What `profile` says of a frame.
+
+    Attributes:
+        tubes: Tubes by slot, then what is left over.
+        noise: Of the sensor, as it was used.
+    """
+
+    tubes: tuple[ProfileTube, ...]
+    noise: SensorNoise
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Part:
+    """A flat rack, or the neighbourhood of a slot of a bowed one, and the tops in it."""
+
+    T_camera_rack: FloatArray
+    rack: RackModel
+    covariance: FloatArray | None
+    measured: Measured
+    local: SlotFrame | None
+
+    def models(self, tubes: Sequence[TubeModel]) -> list[TubeModel]:
+        """Types of the tops."""
+        return [tubes[k] for k in self.measured.tops.tube]
+
+
 def fit_profiles(
     frame: RgbdFrame,
     intrinsics: CameraIntrinsics | None,
@@ -59,8 +91,29 @@ def fit_profiles(
     rack_covariance: FloatArray | None = None,
     allowed: NDArray[np.bool_] | None = None,
     bow: FaceBow | None = None,
+    noise: SensorNoise | None = None,
 ) -> tuple[ProfileTube, ...]:
-    """Poses of all tubes of a frame.
+    """Poses of all tubes of a frame: `fit_frame`, the tubes alone."""
+    return fit_frame(
+        frame, intrinsics, T_camera_rack, rack, tubes, config,
+        rack_covariance=rack_covariance, allowed=allowed, bow=bow, noise=noise,
+    ).tubes  # fmt: skip
+
+
+def fit_frame(
+    frame: RgbdFrame,
+    intrinsics: CameraIntrinsics | None,
+    T_camera_rack: FloatArray,
+    rack: RackModel,
+    tubes: Sequence[TubeModel],
+    config: Config,
+    *,
+    rack_covariance: FloatArray | None = None,
+    allowed: NDArray[np.bool_] | None = None,
+    bow: FaceBow | None = None,
+    noise: SensorNoise | None = None,
+) -> ProfileFit:
+    """Poses of all tubes of a frame, and the noise that they were judged with.
 
     Args:
         frame: The frame.
@@ -68,27 +121,47 @@ def fit_profiles(
         T_camera_rack: The rack's pose, shape (4, 4), metres.
         rack: The rack.
         tubes: Types that can stand in it.
-        config: Sections profile and slots are used.
+        config: Sections profile, sensor and slots are used.
         rack_covariance: Of the rack's pose, shape (6, 6), as `RackPose.covariance`; None counts as exact.
         allowed: Which type may stand in which slot, shape (K, S), where a detector says; all by default.
         bow: Of the rack's face; None counts as flat.
+        noise: Of the sensor, as `measure_noise` has it; None takes the prior of section sensor. Where no table
+            told it, the caps of the frame are asked too.
 
     Returns:
         Tubes by slot, then what is left over; without types, all that stands there is.
     """
-    if tubes and rack.floor_tolerance_mm > SETTLED_MM:
+    noise = prior_noise(config.sensor, "not measured") if noise is None else noise
+    if not tubes:
+        standing = _all_standing(frame, intrinsics, T_camera_rack, rack, config)
+        unknown = find_leftovers(standing, np.full(len(standing.points_m), -1), (), rack, ())
+        return ProfileFit(tuple(_no_tube(left, standing, rack) for left in unknown), noise)
+    if rack.floor_tolerance_mm > SETTLED_MM:
         rack = settle_floor(_all_standing(frame, intrinsics, T_camera_rack, rack, config), rack, tubes, config.profile)
+    config = noisy_config(config, noise, T_camera_rack, rack)
+    parts: list[_Part] = []
     if bow is None or not bow.bow_m.any():
-        return _fit_flat(frame, intrinsics, T_camera_rack, rack, tubes, config, rack_covariance, allowed)
-    found: list[ProfileTube] = []
-    for index in range(len(rack.all_slots)):
-        local = slot_frame(rack, index, bow, rack_covariance)
-        may = None if allowed is None else allowed[:, local.rows]
-        there = _fit_flat(
-            frame, intrinsics, T_camera_rack @ local.T_rack_local, local.rack, tubes, config, local.covariance, may
-        )
-        found += [_of_rack(tube, local) for tube in there if _is_of(tube, local.rack)]
-    return (*(tube for tube in found if tube.tube is not None), *(tube for tube in found if tube.tube is None))
+        measured = measure_tops(frame, intrinsics, T_camera_rack, rack, tubes, config, allowed)
+        parts.append(_Part(T_camera_rack, rack, rack_covariance, measured, None))
+    else:
+        for index in range(len(rack.all_slots)):
+            local = slot_frame(rack, index, bow, rack_covariance)
+            may, T = None if allowed is None else allowed[:, local.rows], T_camera_rack @ local.T_rack_local
+            measured = measure_tops(frame, intrinsics, T, local.rack, tubes, config, may)
+            parts.append(_Part(T, local.rack, local.covariance, measured, local))
+    if noise.source in (RACK_TOP, PRIOR):
+        noise = seen_on_caps(noise, [disc for part in parts for disc in _cap_discs(part, tubes)])
+    found = [tube for part in parts for tube in _fit_part(part, tubes, noise, config.profile)]
+    known, unknown_things = ([tube for tube in found if (tube.tube is None) is none] for none in (False, True))
+    return ProfileFit((*known, *unknown_things), noise)
+
+
+def _cap_discs(part: _Part, tubes: Sequence[TubeModel]) -> list[CapDisc]:
+    """The flat tops of a part's caps; of a slot's neighbourhood, its own."""
+    discs = cap_discs(part.measured, part.models(tubes), part.T_camera_rack)
+    if part.local is None:
+        return list(discs.values())
+    return [disc for i, disc in discs.items() if part.measured.tops.slot[i] == 0]
 
 
 def _is_of(tube: ProfileTube, local: RackModel) -> bool:
@@ -107,37 +180,27 @@ def _of_rack(tube: ProfileTube, local: SlotFrame) -> ProfileTube:
     return replace(tube, points_m=points_m, pose=pose)
 
 
-def _fit_flat(
-    frame: RgbdFrame,
-    intrinsics: CameraIntrinsics | None,
-    T_camera_rack: FloatArray,
-    rack: RackModel,
-    tubes: Sequence[TubeModel],
-    config: Config,
-    rack_covariance: FloatArray | None,
-    allowed: NDArray[np.bool_] | None,
-) -> tuple[ProfileTube, ...]:
-    """Poses of all tubes in a rack with a flat face; arguments as of `fit_profiles`."""
-    if not tubes:
-        standing = _all_standing(frame, intrinsics, T_camera_rack, rack, config)
-        unknown = find_leftovers(standing, np.full(len(standing.points_m), -1), (), rack, ())
-        return tuple(_no_tube(left, standing, rack) for left in unknown)
-    measured = measure_tops(frame, intrinsics, T_camera_rack, rack, tubes, config, allowed)
-    models = [tubes[k] for k in measured.tops.tube]
-    leftovers = find_leftovers(measured.points, measured.label, measured.tops.slot.tolist(), rack, tubes)
-    posterior = fuse(measured, models, rack, config.profile)
-    covariance = pose_covariance(posterior, measured, models, rack, config.profile, rack_covariance)
-    rise = _rise_m(measured, models, rack, config.profile)
+def _fit_part(part: _Part, tubes: Sequence[TubeModel], noise: SensorNoise, config: ProfileConfig) -> list[ProfileTube]:
+    """Poses of all tubes in a rack with a flat face, in the frame of the rack that it is a part of."""
+    rack, models = part.rack, part.models(tubes)
+    leftovers = find_leftovers(part.measured.points, part.measured.label, part.measured.tops.slot.tolist(), rack, tubes)
+    measured, top_noise = believed(part.measured, models, part.T_camera_rack, rack, noise, config, part.covariance)
+    posterior = fuse(measured, models, rack, config, wall_noise(measured.points.camera_m, rack, noise))
+    covariance = pose_covariance(posterior, measured, models, rack, config, part.covariance, top_noise)
+    rise = rise_m(measured, models, rack, config, top_noise)
     clouds = _clouds(measured, len(models))
     found = []
-    poses = _poses(measured, posterior, covariance, rise, clouds, models, rack, config.profile)
+    poses = _poses(measured, posterior, covariance, rise, clouds, models, rack, config, top_noise)
     for i, (tube, pose) in enumerate(zip(models, poses, strict=True)):
         slot = rack.all_slots[measured.tops.slot[i]]
         crowd = next((left.reason for left in leftovers if left.slot == measured.tops.slot[i]), "")
         if crowd and pose.status is TubeStatus.OK:
             pose = _rejected(pose, said("two_in_slot", crowd))
         found.append(ProfileTube(slot.name, tube, float(measured.tops.support[i]), clouds[i], pose))
-    return (*found, *(_no_tube(left, measured.points, rack) for left in leftovers))
+    found += [_no_tube(left, measured.points, rack) for left in leftovers]
+    if part.local is None:
+        return found
+    return [_of_rack(tube, part.local) for tube in found if _is_of(tube, rack)]
 
 
 def _clouds(measured: Measured, count: int) -> list[FloatArray]:
@@ -154,82 +217,6 @@ def _all_standing(
     return gather_standing(frame, intrinsics, T_camera_rack, rack, lowest_m, lowest_m + TALLEST_TUBE_M)
 
 
-def fuse(measured: Measured, models: Sequence[TubeModel], rack: RackModel, config: ProfileConfig) -> Posterior:
-    """Axes from tops and slots, then from the walls near them too."""
-    slots = [rack.all_slots[i] for i in measured.tops.slot]
-    centers = rack.slot_centers_m[measured.tops.slot]
-    tops = top_evidence(measured, models, rack, config)
-    start = combine(tops, slots, models, rack, config, FEW_SAMPLES)
-    walls = wall_evidence(measured.points, measured.label, start.mean, centers, models, rack, config)
-    return combine(tops + walls, slots, models, rack, config)
-
-
-def top_evidence(measured: Measured, models: Sequence[TubeModel], rack: RackModel, config: ProfileConfig) -> Evidence:
-    """What tops say of axes: the axis through the circle's middle, along the normal but for the cap's seat."""
-    count = len(models)
-    centers = rack.slot_centers_m[measured.tops.slot]
-    lever = measured.level_m - rack.floor_m - per_model(models, lambda tube: tube.pivot_height_m)
-    through = np.zeros((count, 2, 4))
-    through[:, [0, 1], [0, 1]] = 1.0
-    through[:, [0, 1], [2, 3]] = lever[:, None]
-    along = np.zeros((count, 2, 4))
-    along[:, [0, 1], [2, 3]] = 1.0
-    variance = measured.planes.slope_var + config.cap_tilt_rad**2
-    return evidence(through, measured.center_m - centers, measured.circles.covariance_m2) + evidence(
-        along, -measured.planes.slope, variance[:, None, None] * np.eye(2)
-    )
-
-
-def _rise_m(measured: Measured, models: Sequence[TubeModel], rack: RackModel, config: ProfileConfig) -> FloatArray:
-    """How far tubes stand above the floor, shape (T,), metres: the floor's height and a closed top's, weighed."""
-    expected = rack.floor_m + per_model(models, lambda tube: tube.height_m)
-    seen = np.nan_to_num(measured.planes.height_m - expected)
-    return np.asarray(seen * _rise_gain(measured, rack, config))
-
-
-def _rise_gain(measured: Measured, rack: RackModel, config: ProfileConfig) -> FloatArray:
-    """Weight of a top's height against the floor's, shape (T,): 0 for open tops, whose light comes from below them."""
-    floor2 = (rack.floor_tolerance_mm * 1e-3) ** 2
-    gain = floor2 / (floor2 + config.cap_height_m**2)
-    return np.where(np.isfinite(measured.planes.height_m), gain, 0.0)
-
-
-def pose_covariance(
-    posterior: Posterior,
-    measured: Measured,
-    models: Sequence[TubeModel],
-    rack: RackModel,
-    config: ProfileConfig,
-    rack_covariance: FloatArray | None,
-) -> FloatArray:
-    """Covariance of poses over (rotation about x, about y; translation along x, y, z), shape (T, 5, 5), rad and metres.
-
-    The axes are the tube's own at its bottom. The rack's error moves the floor and not what was seen of the top: it
-    shifts the bottom, and turns the axis by that shift over the distance between them.
-    """
-    count = len(models)
-    held, height = per_model(models, lambda tube: (tube.pivot_height_m, tube.height_m)).reshape(-1, 2).T
-    J = np.zeros((count, 5, 4))
-    J[:, 0, 3], J[:, 1, 2] = -1.0, 1.0
-    J[:, [2, 3], [0, 1]] = 1.0
-    J[:, [2, 3], [2, 3]] = -held[:, None]
-    covariance = np.einsum("tij,tjk,tlk->til", J, posterior.covariance, J)
-    covariance[:, 4, 4] += (1 - _rise_gain(measured, rack, config)) * (rack.floor_tolerance_mm * 1e-3) ** 2
-    if rack_covariance is None:
-        return np.asarray(covariance)
-    arm = np.column_stack([rack.slot_centers_m[measured.tops.slot], np.full(count, rack.floor_m - rack.height_m)])
-    moved = np.zeros((count, 3, 6))
-    moved[:, :, 3:] = np.eye(3)
-    moved[:, 0, 1], moved[:, 0, 2] = arm[:, 2], -arm[:, 1]
-    moved[:, 1, 0], moved[:, 1, 2] = -arm[:, 2], arm[:, 0]
-    moved[:, 2, 0], moved[:, 2, 1] = arm[:, 1], -arm[:, 0]
-    K = np.zeros((count, 5, 3))
-    K[:, 0, 1], K[:, 1, 0] = 1 / height, -1 / height
-    K[:, [2, 3, 4], [0, 1, 2]] = 1.0
-    chain = np.einsum("tij,tjk->tik", K, moved)
-    return np.asarray(covariance + np.einsum("tij,jk,tlk->til", chain, rack_covariance, chain))
-
-
 def _poses(
     measured: Measured,
     posterior: Posterior,
@@ -239,6 +226,7 @@ def _poses(
     models: Sequence[TubeModel],
     rack: RackModel,
     config: ProfileConfig,
+    noise: TopNoise,
 ) -> list[TubePose]:
     """Pose and verdict of every tube."""
     tops, circles = measured.tops, measured.circles
@@ -262,10 +250,12 @@ def _poses(
     }
     columns = [values.tolist() for values in verdicts.values()]
     sure, measures = confidence(covariance), _top_measures(measured, axis[:, 2], models, rack)
+    limits = height_limit_m(noise.height_var_m2, config).tolist()
     found = []
     for i, (tube, *values) in enumerate(zip(models, *columns, strict=True)):
         told = dict(zip(verdicts, values, strict=True))
-        checks = tube_checks(**told, tube=tube, rack=rack, slot=rack.all_slots[tops.slot[i]].name, config=config)
+        gates = config.model_copy(update={"max_height_error_m": limits[i]})
+        checks = tube_checks(**told, tube=tube, rack=rack, slot=rack.all_slots[tops.slot[i]].name, config=gates)
         reason = first_reason(checks, tube.name)
         found.append(
             TubePose(

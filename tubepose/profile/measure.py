@@ -32,7 +32,8 @@ from tubepose.transforms import FloatArray
 
 TALLER_M = 0.08
 """Something that stands on something else is looked for this far above the tallest tube."""
-ON_PLANE_M = 5.0e-4
+ON_PLANE_SHARE = 1 / 3
+"""Points of a circle lie this near its top's plane, as a share of the band that grows with the sensor's noise."""
 DISC_GAP_M = 0.9e-3
 RIM_GAP_M = 0.6e-3
 """Where another top is nearer than this, the end of a disc (the ring of a rim) is not told from the other's."""
@@ -278,7 +279,8 @@ def _measure_closed(
     planes = fit_top_planes(of, offset, standing.points_m[rows, 2], shape.level_m, shape.radius_m, config)
     ends_of, flat = ends_on_planes(
         standing.points_m, rows, of, offset, np.column_stack([planes.height_m, planes.slope]),
-        np.maximum(shape.radius_m - OUTLINE_DEPTH_M, 0.0), ON_PLANE_M, tops.center_m, standing.camera_m,
+        np.maximum(shape.radius_m - OUTLINE_DEPTH_M - config.edge_ramp_m, 0.0), config.top_band_m * ON_PLANE_SHARE,
+        tops.center_m, standing.camera_m,
     )  # fmt: skip
     blocked = blocked_sectors(tops.center_m, shape.radius_m, DISC_GAP_M)
     return planes, fit_discs(ends_of, flat, shape.radius_m, blocked, config)

@@ -94,6 +94,7 @@ def fit_discs(
     shift = np.zeros((count, 2))
     circles = None
     for inside_m, outside_m in WIDTHS_M:
+        inside_m += config.edge_ramp_m  # a ramp lies below the top's plane: its disc ends that much farther in
         end_m, seen, counting_m = sector_ends(label, offset_m, shift, radius_m, inside_m, outside_m, SECTORS)
         sigma_m = np.hypot(config.outline_noise_m, counting_m)
         circles = fit_circles(end_m - radius_m[:, None], seen & ~blocked, config, sigma_m, config.outline_bias_m)

@@ -22,7 +22,9 @@ class TopPlanes:
     Attributes:
         height_m: Height of the plane above the rack's base at the given centre, shape (T,), metres; NaN without one.
         slope: Its rise along x and y, shape (T, 2).
-        slope_var: Variance of each slope, shape (T,).
+        slope_var: Variance of each slope, shape (T,): by the scatter of the points, until `believed` raises it to what
+            the sensor's noise leaves.
+        height_var_m2: Variance of the height by the scatter of the points, shape (T,).
         rms_m: RMS distance of the points that count, shape (T,), metres; NaN without a plane.
         n_points: Points that count, shape (T,).
     """
@@ -30,6 +32,7 @@ class TopPlanes:
     height_m: FloatArray
     slope: FloatArray
     slope_var: FloatArray
+    height_var_m2: FloatArray
     rms_m: FloatArray
     n_points: NDArray[np.intp]
 
@@ -46,8 +49,8 @@ def fit_top_planes(
 
     The rounds see `plane_points` of a top's points, the last one all of them.
 
-    The variance of a slope has two parts: the noise of single points, which many points average out, and the error
-    that points within `shared_error_reach_m` share, which they do not.
+    The variances are those of independent points. Errors that neighbours share do not average out, and no single top
+    shows them: its plane absorbs most of them. They are the sensor's, and `believed` adds them.
 
     Args:
         label: Tube of each point, shape (N,).
@@ -64,14 +67,13 @@ def fit_top_planes(
         label, offset_m, height_m, expected_m, config.top_band_m, inner_m, step, config.min_top_points / 4
     )
     enough = n >= config.min_top_points
-    lever2 = radius_m**2 / 4
-    # One independent shared error per patch of the error's reach.
-    patches = np.maximum((radius_m / config.shared_error_reach_m) ** 2, 3.0)
-    slope_var = (sigma**2 / np.maximum(n, 3) + config.shared_error_m**2 / patches) / lever2
+    height_var = sigma**2 / np.maximum(n, 3)
+    lever2 = np.maximum(inner_m, EDGE_M) ** 2 / 4
     return TopPlanes(
         np.where(enough, planes[:, 0], np.nan),
         np.where(enough[:, None], planes[:, 1:], np.nan),
-        slope_var,
+        height_var / lever2,
+        height_var,
         np.where(enough, sigma, np.nan),
         n.astype(np.intp),
     )
@@ -80,7 +82,7 @@ def fit_top_planes(
 def unknown_planes(count: int) -> TopPlanes:
     """Planes that nothing is known of."""
     nothing = np.full(count, np.nan)
-    return TopPlanes(nothing, np.full((count, 2), np.nan), nothing, nothing, np.zeros(count, np.intp))
+    return TopPlanes(nothing, np.full((count, 2), np.nan), nothing, nothing, nothing, np.zeros(count, np.intp))
 
 
 def top_spacing_m(planes: TopPlanes, radius_m: FloatArray) -> FloatArray:

@@ -9,6 +9,7 @@ radius that are more than those beside it.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,6 +26,25 @@ PEAK = 2.0
 SKIRT_GAP_M = 1.0e-3
 
 
+@dataclass(frozen=True, slots=True)
+class WallNoise:
+    """What the sensor's noise does to the distance of a wall's points from its axis.
+
+    Attributes:
+        independent_m: Standard deviation of a point's own part, metres: of its depth, times the sine of the angle
+            between line of sight and wall.
+        shared_m: Of the part that neighbours share.
+        patch_points: How many points share it.
+    """
+
+    independent_m: float
+    shared_m: float
+    patch_points: float
+
+
+NO_WALL_NOISE = WallNoise(0.0, 0.0, 1.0)
+
+
 def wall_evidence(
     standing: Standing,
     label: NDArray[np.intp],
@@ -33,6 +53,7 @@ def wall_evidence(
     tubes: Sequence[TubeModel],
     rack: RackModel,
     config: ProfileConfig,
+    noise: WallNoise | None = None,
 ) -> Evidence:
     """Evidence of the walls of all tubes, linearised at their poses.
 
@@ -48,7 +69,8 @@ def wall_evidence(
         centers_m: Centre of every tube's slot, shape (T, 2).
         tubes: Type of every tube.
         rack: The rack.
-        config: Noise of walls.
+        config: Noise of walls that can be believed.
+        noise: Of the sensor, which adds to it; None counts as none.
     """
     count = len(tubes)
     if count == 0:
@@ -57,7 +79,10 @@ def wall_evidence(
     skirt = per_model(tubes, _skirt_m) - SKIRT_GAP_M
     body = per_model(tubes, lambda tube: [tube.body.bottom_diameter_mm, tube.body.top_diameter_mm]) * 0.5e-3
     ends = per_model(tubes, lambda tube: [tube.body.bottom_height_mm, tube.body.height_mm]) * 1e-3
-    sigma = config.wall_noise_m
+    noise = NO_WALL_NOISE if noise is None else noise
+    sigma = float(np.sqrt(config.wall_noise_m**2 + noise.independent_m**2 + noise.shared_m**2))
+    own2 = config.wall_noise_m**2 + noise.independent_m**2
+    counted2 = own2 * config.wall_redundancy + noise.shared_m**2 * max(noise.patch_points, config.wall_redundancy)
     # The cut through a leaning tube is an ellipse: across the lean the radius, along it longer by 1 / cos.
     residual, normal, above, of = wall_rows(
         standing.points_m, label, standing.camera_m, pose, centers_m, rack.floor_m, held, skirt, body, ends,
@@ -66,7 +91,7 @@ def wall_evidence(
     near = np.abs(residual) < PEAK * sigma
     n_near, n_beside = (np.bincount(of[chosen], minlength=count) for chosen in (near, ~near))
     peak = np.clip((n_near - n_beside) / np.maximum(n_near, 1), 0.0, 1.0)
-    weight = peak**2 * (n_near >= config.min_wall_points) / (sigma**2 * config.wall_redundancy)
+    weight = peak**2 * (n_near >= config.min_wall_points) / counted2
     # The residual is wanted to vanish: rows x = target; the radius, the last unknown, is marginalised.
     matrix, vector = wall_sums(residual, normal, above, of, pose, weight, PEAK * sigma)
     matrix[:, 4, 4] += 1 / config.wall_radius_m**2

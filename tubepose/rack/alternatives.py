@@ -15,7 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tubepose.labware import RackModel, SlotModel, catalogue
-from tubepose.rack.face import Face, Grid
+from tubepose.rack import view_kernels as view_kernels
+from tubepose.rack.face import Face, Grid, solid_levels
 from tubepose.transforms import FloatArray
 
 # Fields that differ by less than this everywhere in a cell are the same there.
@@ -27,8 +28,10 @@ SIDES = {"+x": (1, 0), "-x": (-1, 0), "+y": (0, 1), "-y": (0, -1)}
 FAR_M = 1.0
 # Racks whose sides differ by less look alike at a first look.
 ALIKE_M = 6e-3
-# Light that goes astray is alike over a slot and its ribs.
+# Light that goes astray is alike over a slot and its ribs, and what returns nothing does so in whole patches: one of
+# them speaks for an alternative by no more than this, nats.
 CLUSTER_M = 20e-3
+MOST_MISSED = 10.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -38,14 +41,14 @@ class Alternative:
     Attributes:
         code: What kind of difference it is.
         words: What it is, to be read after "the scan shows".
-        distance_m: Signed distance of every cell's centre from its solid part, shape (X * Y,), metres.
-        rows: Cells in which it differs, indices.
+        rows: Cells in which it differs, indices, shape (K,).
+        levels: Their chance of being solid, `solid_levels`, shape (K,).
     """
 
     code: str
     words: str
-    distance_m: FloatArray
     rows: NDArray[np.intp]
+    levels: NDArray[np.uint8]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -71,16 +74,12 @@ def gains(face: Face, rack: RackModel) -> tuple[Gain, ...]:
         rack: The rack.
     """
     own_m = own_distance_m(rack, face.grid)
-    rates = face.rates(own_m)
-    best: dict[str, Gain] = {}
+    tables, (square, count) = face.tables(face.rates(own_m)), squares(face.grid)
+    own, best = _own_levels(rack, _key(face.grid)), dict[str, Gain]()
     for other in alternatives(rack, face.grid):
-        more = face.log_likelihood(other.distance_m, rates, other.rows)
-        more -= face.log_likelihood(own_m, rates, other.rows)
-        # What was not seen can speak against an alternative, and not for one.
-        nothing = face.nothing.ravel()[other.rows]
-        if more[nothing].sum() > 0:
-            more = np.where(nothing, 0.0, more)
-        nats = float(more.sum())
+        missed = np.zeros(count)
+        seen = view_kernels.gained(face.kinds, face.shares, other.rows, other.levels, own, *tables, square, missed)
+        nats = float(seen + np.minimum(missed, MOST_MISSED).sum())
         if other.code not in best or nats > best[other.code].nats:
             best[other.code] = Gain(other.code, other.words, nats)
     return tuple(best.values())
@@ -108,7 +107,7 @@ def _cached(rack: RackModel, key: tuple[float, ...]) -> tuple[Alternative, ...]:
     found = []
     for code, words, distance_m in _distances(rack, grid):
         rows = np.flatnonzero(np.abs(distance_m - own_m) > SAME_M)
-        found.append(Alternative(code, words, distance_m, rows))
+        found.append(Alternative(code, words, rows, solid_levels(distance_m[rows])))
     return tuple(found)
 
 
@@ -127,6 +126,11 @@ def _own(rack: RackModel, key: tuple[float, ...]) -> FloatArray:
     return np.maximum(_to_outline_m(rack, grid), _to_openings_m(rack.all_slots, grid))
 
 
+@lru_cache(maxsize=64)
+def _own_levels(rack: RackModel, key: tuple[float, ...]) -> NDArray[np.uint8]:
+    return solid_levels(_own(rack, key))
+
+
 def own_distance_m(rack: RackModel, grid: Grid) -> FloatArray:
     """Signed distance of a grid's cells from a rack's solid part, shape (X * Y,), metres."""
     return _own(rack, _key(grid))
@@ -135,7 +139,7 @@ def own_distance_m(rack: RackModel, grid: Grid) -> FloatArray:
 def _distances(rack: RackModel, grid: Grid) -> Iterator[tuple[str, str, FloatArray]]:
     outline_m, slots = _to_outline_m(rack, grid), rack.all_slots
     yield "no_openings", "a plate without openings", outline_m
-    for other in _lookalikes(rack):
+    for other in lookalikes(rack):
         for turned in (False, True):
             other_m = np.maximum(_to_outline_m(other, grid), _to_openings_m(other.all_slots, grid)).reshape(grid.shape)
             yield "other_rack", other.name, (other_m[::-1, ::-1] if turned else other_m).ravel()
@@ -162,7 +166,7 @@ def _distances(rack: RackModel, grid: Grid) -> Iterator[tuple[str, str, FloatArr
             yield f"{what}_fewer", f"a {what} of slots fewer at {side}", np.maximum(outline_m, without)
 
 
-def _lookalikes(rack: RackModel) -> tuple[RackModel, ...]:
+def lookalikes(rack: RackModel) -> tuple[RackModel, ...]:
     """Racks of the catalogue whose outline is nearly a rack's own."""
     racks = (item for item in catalogue().values() if isinstance(item, RackModel) and item.name != rack.name)
     return tuple(item for item in racks if np.abs(item.outline_m - rack.outline_m).max() < ALIKE_M)

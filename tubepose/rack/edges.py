@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
-from itertools import islice
+from itertools import chain, islice
 
 import numpy as np
 
@@ -15,20 +15,25 @@ from tubepose.config import Config, RackConfig, RackTopConfig
 from tubepose.labware import RackModel
 from tubepose.preprocessing import point_spacing_m, thin
 from tubepose.rack.agreement import outline_fits, rough_evidence
+from tubepose.rack.alternatives import lookalikes
 from tubepose.rack.field import top_field
-from tubepose.rack.fit import RoughFit, filled, rack_frame
+from tubepose.rack.fit import RoughFit, filled, rack_frame, top_frame
 from tubepose.rack.insufficient import outline_words, too_coarse
 from tubepose.rack.looks import on_lattice, seen_near
 from tubepose.rack.pose import MIN_POINTS, RackPose, RackStatus
-from tubepose.rack.search import Band, levels, search
-from tubepose.rack.settling import Registration, settled
+from tubepose.rack.search import Band, Hypothesis, levels, search, search_by_tops
+from tubepose.rack.settling import Registration, likelihood_at, settled
 from tubepose.rack.turns import choose_turn, turns_of, unused_hint
-from tubepose.transforms import FloatArray
+from tubepose.transforms import FloatArray, translation
 
 # Places whose coarse picture agrees less than this, compared with one that was accepted, are no rivals of it.
 RIVAL_WORTH = 0.4
 # The fine rounds add no more than this to a pose's evidence.
 ROUGH_MARGIN = 1.05
+# Places that are looked at where tubes hide a rack.
+MOST_HIDDEN = 4
+# Of a face of which so much is seen a rack that looks alike is told by its openings.
+MUCH_SEEN = 0.4
 # A rack that tubes in so many of its slots hold is nowhere else.
 CLEAR_TOPS = 0.6
 
@@ -42,7 +47,25 @@ def register_edges(
         return RackPose(RackStatus.INSUFFICIENT, few, code="too_few_points")
     few_m = coarse_sample(points_m, config.rack_top)
     best = best_registration(points_m, few_m, levels(few_m, config.rack_top), rack, config)
+    if best is not None and not best.reason:
+        best = _against_lookalikes(best, points_m, rack, config.rack)
     return pose_of(best, points_m, rack, config, hint, intrinsics)
+
+
+def _against_lookalikes(best: Registration, points_m: FloatArray, rack: RackModel, config: RackConfig) -> Registration:
+    """The same, refused where a rack of the catalogue with nearly its outline, registered there, is likelier.
+
+    Where much of a face is seen, that was told in the rack's own pose already.
+    """
+    if best.agreement.coverage >= MUCH_SEEN:
+        return best
+    checks = list(best.checks)
+    for other in lookalikes(rack):
+        T_camera_other = top_frame(best.fit.T_camera_rack, rack) @ translation([0, 0, -other.height_m])
+        gain = likelihood_at(points_m, T_camera_other, other, config) - best.log_likelihood
+        if np.isfinite(gain):
+            checks.append(Check("other_rack", gain, config.max_gain, gain <= config.max_gain, detail=other.name))
+    return replace(best, checks=tuple(checks))
 
 
 def pose_of(
@@ -90,15 +113,22 @@ def best_registration(
     """
     found: list[Registration] = []
     been: list[FloatArray] = []
+    searched: list[list[Band]] = []
     worth = 0.0
 
     def until_settled() -> Iterator[list[Band]]:
         for level in found_levels:
+            searched.append(level)
             yield level
             if any(not other.reason and _uncontradicted(other, config.rack) for other in found):
                 return
 
-    for hypothesis in islice(search(until_settled(), rack), most):
+    def hidden() -> Iterator[Hypothesis]:
+        """Where nothing was accepted, tubes may hide the rack."""
+        if all(other.reason for other in found):
+            yield from islice(search_by_tops(searched, few_m, rack), MOST_HIDDEN)
+
+    for hypothesis in chain(islice(search(until_settled(), rack), most), hidden()):
         if hypothesis.worth < RIVAL_WORTH * worth or _known(hypothesis.T_camera_rack, been, rack):
             continue
         near_m, rough = on_lattice(few_m, hypothesis.T_camera_rack, rack)

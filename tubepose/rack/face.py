@@ -13,6 +13,7 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import expit
 
 from tubepose.labware import RackModel
 from tubepose.rack import view_kernels as view_kernels
@@ -30,6 +31,8 @@ SEEN_BELOW_M = 1.5e-3
 SHADOW_M = 20e-3
 # Blur of an edge: a pixel may be half on either side.
 BLUR_M = 0.4e-3
+# Steps that chances are counted in.
+LEVELS = 256
 # Points nearer than this share their label's error: they count as one.
 INDEPENDENT_M = 1.5e-3
 # A cell this far from every edge tells how often nothing returns from solid parts (ribs are 1 mm wide) and open ones.
@@ -66,18 +69,23 @@ def face_grid(rack: RackModel, spacing_m: float, beyond_m: float) -> Grid:
     return Grid(-half * cell_m, float(cell_m), (int(2 * half[0] + 1), int(2 * half[1] + 1)))
 
 
+def solid_levels(distance_m: FloatArray) -> NDArray[np.uint8]:
+    """Chance of cells to be solid, logistic((shift - d) / blur), in `LEVELS` steps; d (K,) their distance, metres."""
+    return np.asarray(np.rint((LEVELS - 1) * expit((EDGE_SHIFT_M - distance_m) / BLUR_M)), np.uint8)
+
+
 class Rates(NamedTuple):
     """What cells do besides showing what they are.
 
     Attributes:
-        hidden: How often nothing returns from a solid cell: away from what stands up, and beside it.
-        dark: How often nothing returns from an open one, likewise.
+        hidden: How often nothing returns from a solid cell, by the zones of `Face.zones`.
+        dark: How often nothing returns from an open one, likewise: wells are darker than what lies beside a rack.
         stray: How often an open cell looks solid.
         crossed: The same below what stands up: a tube's wall crosses the height of the face.
     """
 
-    hidden: tuple[float, float]
-    dark: tuple[float, float]
+    hidden: tuple[float, ...]
+    dark: tuple[float, ...]
     stray: float
     crossed: float
 
@@ -93,6 +101,7 @@ class Face:
         nothing: Cells, between others that have some, in which no line of sight ended at any height.
         standing: Cells above which something stands.
         shaded: Cells beside what stands up, where a projector leaves shadows.
+        beyond: Cells outside of the rack's outline.
         weight: How many independent observations one cell is.
     """
 
@@ -102,6 +111,7 @@ class Face:
     nothing: NDArray[np.bool_]
     standing: NDArray[np.bool_]
     shaded: NDArray[np.bool_]
+    beyond: NDArray[np.bool_]
     weight: float
 
     @cached_property
@@ -109,22 +119,44 @@ class Face:
         """Cells that say solid or open."""
         return np.isfinite(self.solid)
 
-    def log_likelihood(self, distance_m: FloatArray, rates: Rates, rows: NDArray[np.intp]) -> FloatArray:
-        """Log likelihood of some cells, shape (K,), nats.
+    @cached_property
+    def zones(self) -> NDArray[np.uint8]:
+        """Zone of every cell, shape (X, Y): 1 more where it is shaded, 2 more where it is beyond the outline."""
+        return np.asarray(self.shaded + 2 * self.beyond, np.uint8)
 
-        A cell at signed distance d from the solid part is solid with s = logistic((shift - d) / blur), returns nothing
-        with the rate of what it is, and otherwise shows what it is, but for a share of wrong ones.
+    @cached_property
+    def kinds(self) -> NDArray[np.uint8]:
+        """What every cell is, shape (X * Y,): its zone, 4 more below what stands up, 8 for nothing; 16 for no news."""
+        kinds = np.where(self.seen, self.zones + 4 * self.standing, np.where(self.nothing, 8 + self.zones, 16))
+        return np.asarray(kinds.ravel(), np.uint8)
+
+    @cached_property
+    def shares(self) -> FloatArray:
+        """`solid`, 0 where nothing was seen, shape (X * Y,)."""
+        return np.nan_to_num(self.solid).ravel()
+
+    def tables(self, rates: Rates) -> tuple[FloatArray, FloatArray]:
+        """Log likelihoods of cells by their kind and their chance of being solid, nats; see `view_kernels.gained`.
+
+        A cell that is solid with the chance s returns nothing with the rate of what it is, and otherwise shows what it
+        is, but for a share of wrong ones.
+        """
+        s = np.arange(LEVELS) / (LEVELS - 1)
+        none = np.array(rates.hidden)[:, None] * s + np.array(rates.dark)[:, None] * (1 - s)
+        seen = []
+        for wrong in (rates.stray, rates.crossed):
+            shown = wrong + (1 - WRONG_SHARE - wrong) * s
+            seen.append(np.log1p(-none)[:, None] + np.log(np.stack([shown, 1 - shown])))
+        return self.weight * np.concatenate(seen), self.weight * np.log(none)
+
+    def log_likelihood(self, distance_m: FloatArray) -> float:
+        """Log likelihood of all cells with a hypothesis, nats.
 
         Args:
-            distance_m: Signed distance of every cell's centre, negative in the solid, shape (X * Y,), metres.
-            rates: What else cells do.
-            rows: The cells that count, indices into the flattened grid.
+            distance_m: Signed distance of every cell's centre from its solid part, shape (X * Y,), metres.
         """
-        found = view_kernels.cell_logs(
-            self.solid.ravel(), self.nothing.ravel(), self.standing.ravel(), self.shaded.ravel(), distance_m[rows],
-            rows, rates.hidden, rates.dark, rates.stray, rates.crossed, WRONG_SHARE, EDGE_SHIFT_M, BLUR_M,
-        )  # fmt: skip
-        return np.asarray(self.weight * found)
+        tables = self.tables(self.rates(distance_m))
+        return float(view_kernels.whole(self.kinds, self.shares, solid_levels(distance_m), *tables))
 
     def rates(self, distance_m: FloatArray) -> Rates:
         """What cells do besides showing what they are, by those of a hypothesis (X * Y,), 2 to 90 %.
@@ -134,18 +166,18 @@ class Face:
         """
         distance_m = distance_m.reshape(self.grid.shape)
         solid, opened = distance_m < -INSIDE_M, distance_m > OPEN_M
+        zones = [self.zones == zone for zone in range(4)]
         hidden, dark = (
-            [
-                _rate(self.nothing & cells & zone, self.seen & cells & zone, NOTHING)
-                for zone in (~self.shaded, self.shaded)
-            ]
+            [_rate(self.nothing & cells & zone, self.seen & cells & zone, NOTHING) for zone in zones]
             for cells in (solid, opened)
         )
+        # Hardly a cell of a rack is solid beyond its outline: those within it tell.
+        hidden[2:] = hidden[:2]
         clear, below = opened & self.seen & ~self.standing, opened & self.seen & self.standing
         at = np.nan_to_num(self.solid) > 0.5
         stray, crossed = (_rate(cells & at, cells & ~at, WRONG_SHARE) for cells in (clear, below))
         stray = min(stray, MOST_STRAY)
-        return Rates((min(hidden[0], dark[0]), min(hidden[1], dark[1])), (dark[0], dark[1]), stray, max(crossed, stray))
+        return Rates(tuple(map(min, hidden, dark)), tuple(dark), stray, max(crossed, stray))
 
 
 def _rate(some: NDArray[np.bool_], others: NDArray[np.bool_], expected: float) -> float:
@@ -179,8 +211,9 @@ def look_at_face(
     empty = (told + above + other) == 0
     nothing, shaded = empty & _surrounded(~empty), _beside(above > told, grid.cell_m)
     independent = min(1.0, (max(grid.cell_m, spacing_m) / INDEPENDENT_M) ** 2)
+    beyond = np.any(np.abs(grid.centers_m) > rack.outline_m / 2, axis=-1)
     places = np.where(clear[..., None], sums.transpose(1, 2, 0) / np.maximum(told, 1)[..., None], grid.centers_m)
-    return Face(grid, places, solid, nothing, _footprint(standing > 0, grid.cell_m), shaded, independent)
+    return Face(grid, places, solid, nothing, _footprint(standing > 0, grid.cell_m), shaded, beyond, independent)
 
 
 def _footprint(standing: NDArray[np.bool_], cell_m: float) -> NDArray[np.bool_]:

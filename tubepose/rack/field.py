@@ -29,6 +29,8 @@ TURNS = 180
 # Lengths of the waves that a spectrum is compared at: from wide slots to narrow ribs.
 WAVES_M = (45e-3, 5e-3)
 WAVE_COUNT = 40
+# Radius of the tops of tubes in a full rack, as a share of the distance of slots: caps nearly touch.
+TOP_SHARE = 0.42
 # Tops that differ by less than this from their half turn cannot be told from it by any scan.
 SAME_M = 5e-5
 
@@ -128,11 +130,12 @@ def _alike(distance: FloatArray) -> int:
     return 1 if not same(2) else 4 if same(1) else 2
 
 
-@lru_cache(maxsize=32)
-def picture(rack: RackModel, cell_m: float = PICTURE_M) -> Float32:
+@lru_cache(maxsize=64)
+def picture(rack: RackModel, cell_m: float = PICTURE_M, tops: bool = False) -> Float32:
     """The top as cells, (X, Y), centred, odd sides: 1 solid, less than 0 opening or ring around it, 0 beyond.
 
-    Its sum is 0, so that neither a closed surface nor free space looks like a rack.
+    Its sum is 0, so that neither a closed surface nor free space looks like a rack. Of the tops of a full rack's tubes
+    what is 1 are discs over its slots.
     """
     half = rack.outline_m / 2
     counts = np.ceil((half + RING_M) / cell_m).astype(int)
@@ -140,8 +143,10 @@ def picture(rack: RackModel, cell_m: float = PICTURE_M) -> Float32:
     offsets = (np.arange(fine) + 0.5) / fine - 0.5
     axes = [(np.arange(-n, n + 1)[:, None] + offsets).ravel() * cell_m for n in counts]
     xy = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
-    field = top_field(rack)
-    distance, _, known = field.look_up(xy.reshape(-1, 2))
+    distance, _, known = top_field(rack).look_up(xy.reshape(-1, 2))
+    if tops:
+        apart = np.linalg.norm(xy.reshape(-1, 1, 2) - rack.slot_centers_m[None], axis=2)
+        distance = (apart - TOP_SHARE * rack.pitches_m).min(axis=1)
     value = np.where(known, np.where(distance < 0, 1.0, -1.0), 0.0)
     value[value < 0] *= np.sum(value > 0) / np.sum(value < 0)
     value = value.reshape(2 * counts[0] + 1, fine, 2 * counts[1] + 1, fine).mean(axis=(1, 3))
@@ -149,9 +154,10 @@ def picture(rack: RackModel, cell_m: float = PICTURE_M) -> Float32:
 
 
 @lru_cache(maxsize=64)
-def picture_spectrum(rack: RackModel, size: int, turned: bool) -> NDArray[np.complex64]:
+def picture_spectrum(rack: RackModel, size: int, turned: bool, tops: bool = False) -> NDArray[np.complex64]:
     """Conjugate spectrum of the picture in a square of `size` cells, its centre at cell (0, 0)."""
-    image = picture(rack)[::-1, ::-1] if turned else picture(rack)
+    image = picture(rack, tops=tops)
+    image = image[::-1, ::-1] if turned else image
     padded = np.zeros((size, size), np.float32)
     padded[: image.shape[0], : image.shape[1]] = image
     padded = np.roll(padded, (-(image.shape[0] // 2), -(image.shape[1] // 2)), axis=(0, 1))
@@ -181,10 +187,10 @@ def _signature_places(size: int, cell_m: float) -> NDArray[np.intp]:
 
 
 @lru_cache(maxsize=32)
-def solid_signature(rack: RackModel) -> NDArray[np.complex64]:
+def solid_signature(rack: RackModel, tops: bool = False) -> NDArray[np.complex64]:
     """Conjugate Fourier transform over the directions of the signature of the solid part."""
     size = 512
-    image = np.maximum(picture(rack), 0)
+    image = np.maximum(picture(rack, tops=tops), 0)
     padded = np.zeros((size, size), np.float32)
     padded[: image.shape[0], : image.shape[1]] = image
     signature = turn_signature(fft.rfft2(padded), size)

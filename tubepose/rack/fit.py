@@ -15,7 +15,7 @@ from tubepose.labware import RackModel
 from tubepose.rack import fit_kernels
 from tubepose.rack import kernels as kernels
 from tubepose.rack import view_kernels as view_kernels
-from tubepose.rack.field import TopField, openings_field, outline_field, top_field
+from tubepose.rack.field import TopField, top_field
 from tubepose.rack.fit_kernels import INSIDE_M, WIDEST_M
 from tubepose.rack.tops import FLAT_CHI2, Level
 from tubepose.transforms import FloatArray, make_transform, parts, translation
@@ -43,8 +43,6 @@ LEAST_BOW_M = 1e-5
 # Edges are looked for at least this near the top.
 EDGE_WINDOW_M = 1.0e-3
 LEAST_POINTS = 20
-# Points this near the outline may be mixed with what lies beside the rack.
-BORDER_M = 0.5e-3
 # Variance of what nothing is known of.
 UNKNOWN = 1e6
 # Of a pose's six numbers those that the plane tells, and those that the edges tell.
@@ -77,8 +75,6 @@ class Fit:
         T_camera_rack: Array of shape (4, 4), metres.
         covariance: (6, 6), rotation vector (rad) then translation (m), rack frame, about the centre of the top.
         scatter_m: Standard deviation of heights about the plane, from their median, metres.
-        stretch: By how much the slots lie farther apart than the rack's along x and y: 0 for the right rack.
-        stretch_std: Standard deviations of that.
         level: The tops of what stands in the rack that hold it level, where little of its own top is seen or that
             leans otherwise; None where its own ribs tell.
         bow_m: How much higher the face is than the plane at its centre, shape (3,), metres: at the ends of its x axis,
@@ -89,8 +85,6 @@ class Fit:
     T_camera_rack: FloatArray
     covariance: FloatArray
     scatter_m: float
-    stretch: FloatArray
-    stretch_std: FloatArray
     level: Level | None = None
     bow_m: FloatArray = field(default_factory=lambda: np.zeros(3))
     bow_std_m: FloatArray = field(default_factory=lambda: np.full(3, np.inf))
@@ -179,9 +173,8 @@ def refine(state: RoughFit, rack: RackModel) -> Fit:
         for number, (blur_m, widths_m) in enumerate(ROUNDS_M[ROUGH_ROUNDS:], ROUGH_ROUNDS):
             _step(fine, state, top, blur_m, widths_m, tells=number == len(ROUNDS_M) - 1, bowed=bowed)
     covariance = _covariance(state, fine, top)
-    stretch = _stretch(state, rack)
     bow_std_m = np.sqrt(np.diag(state.bow_covariance))
-    return Fit(rack_frame(state, rack), covariance, state.scatter_m, *stretch, state.level, state.bow_m, bow_std_m)
+    return Fit(rack_frame(state, rack), covariance, state.scatter_m, state.level, state.bow_m, bow_std_m)
 
 
 def _significant(bow_m: FloatArray, covariance: FloatArray) -> bool:
@@ -275,24 +268,6 @@ def _step(
         state.bow_m = state.bow_m + face[3:]
     turn = np.asarray(cv2.Rodrigues(np.array([*face[:2], edges[0]]))[0], float)
     state.T_camera_top = np.asarray(T @ make_transform(turn, np.array([*edges[1:], face[2]])))
-
-
-def _stretch(state: RoughFit, rack: RackModel) -> tuple[FloatArray, FloatArray]:
-    """Stretch of the openings' places along x and y with which they agree best, and its standard deviations.
-
-    The outline has no part in it: it is another measure, and would hold the openings where the file has them.
-    """
-    openings = openings_field(rack)
-    xy = at_the_top(state, state.rough_m)
-    beside, _, known = outline_field(rack).look_up(xy)
-    nearer, _, _ = openings.look_up(xy)
-    xy = xy[known & (beside < np.minimum(nearer, -BORDER_M))]
-    if len(xy) < LEAST_POINTS:
-        return np.zeros(2), np.full(2, np.inf)
-    moved, edges = fit_kernels.stretched(xy, *openings.grid)
-    if len(edges[1]) < LEAST_POINTS:
-        return np.zeros(2), np.full(2, np.inf)
-    return np.asarray(moved[3:]), np.sqrt(np.diag(_clustered(*edges)))[3:]
 
 
 def _clustered(normal: FloatArray, scores: FloatArray, points_m: FloatArray) -> FloatArray:

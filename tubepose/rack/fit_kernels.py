@@ -2,7 +2,7 @@
 
 Heights of points on the solid part give the plane and the bow. The edges give the rest: a point at the top's height
 must lie on the solid part, whose signed distance says how far off it is, less the blur of the sensor. Points on
-opposite edges of ribs push in opposite directions, so a blur that makes every rib look wider, or thinner, moves no pose.
+opposite edges of ribs push in opposite directions: a blur that makes every rib look wider, or thinner, moves no pose.
 """
 
 from __future__ import annotations
@@ -27,11 +27,6 @@ WRONG_SHARE = 0.05
 # Neighbours share their depth's error: squares of this length count as one, if they have this many points.
 SHARED_LENGTH_M = 3e-3
 FULL_SQUARE = 12
-# The slots' distances are fitted with a blur that reaches from one rack's ribs to another's, until they settle.
-STRETCH_ROUNDS = 20
-SETTLED_STRETCH = 2e-4
-LOST_STRETCH = 0.1
-STRETCH_BLUR_M = 0.5e-3
 # No step shifts a pose by more.
 LONGEST_STEP_M = 1e-3
 # Two of two real racks are bowed by 1 to 2 mm at the ends of their outline; beyond it a face goes on for so much of it.
@@ -217,13 +212,13 @@ def face_steps(points_m, balance, widths_m, held, bow_m, half_m, columns):
 
 
 @compiled
-def edge_step(points_m, distance_m, slope, window_m, blur_m, count):
-    """Information (M, M) and scores (N, M) of edges about yaw, shift and, for M = 5, stretch; places (N, 2) of them.
+def edge_step(points_m, distance_m, slope, window_m, blur_m):
+    """Information (3, 3) and scores (N, 3) of edges about yaw and shift, and their places (N, 2).
 
     Of points (K, 3) whose heights are within the window, with their distance to the solid part and its gradient.
     """
-    information, design, wrong = np.zeros((count, count)), np.zeros(5), WRONG_SHARE
-    scores, xy = np.empty((len(points_m), count)), np.empty((len(points_m), 2))
+    information, design, wrong = np.zeros((3, 3)), np.zeros(3), WRONG_SHARE
+    scores, xy = np.empty((len(points_m), 3)), np.empty((len(points_m), 2))
     kept = 0
     for k in range(len(points_m)):
         eta = (EDGE_SHIFT_M - distance_m[k]) / blur_m
@@ -233,32 +228,32 @@ def edge_step(points_m, distance_m, slope, window_m, blur_m, count):
         chance, rate = wrong + (1.0 - 2.0 * wrong) * plain, (1.0 - 2.0 * wrong) * plain * (1.0 - plain)
         x, y = points_m[k, 0], points_m[k, 1]
         gx, gy = slope[k, 0] / blur_m, slope[k, 1] / blur_m
-        design[0], design[1], design[2], design[3], design[4] = gy * x - gx * y, gx, gy, gx * x, gy * y
+        design[0], design[1], design[2] = gy * x - gx * y, gx, gy
         weight, score = rate * rate / (chance * (1.0 - chance)), rate / chance
-        for a in range(count):
+        for a in range(3):
             scores[kept, a] = score * design[a]
-            for b in range(a, count):
+            for b in range(a, 3):
                 information[a, b] += weight * design[a] * design[b]
         xy[kept, 0], xy[kept, 1] = x, y
         kept += 1
-    for a in range(count):
+    for a in range(3):
         for b in range(a):
             information[a, b] = information[b, a]
     return information, scores[:kept], xy[:kept]
 
 
 @compiled
-def edge_move(local_m, distance_m, slope, window_m, blur_m, count):
-    """One step of Fisher scoring about yaw, shift and, for `count` 5, stretch; `edge_step` that it is made from."""
-    information, scores, xy = edge_step(local_m, distance_m, slope, window_m, blur_m, count)
-    total = np.zeros(count)
-    for i in range(count):
-        information[i, i] += 1e5 if 1 <= i <= 2 else 1e1
+def edge_move(local_m, distance_m, slope, window_m, blur_m):
+    """One step of Fisher scoring about yaw and shift; `edge_step` that it is made from."""
+    information, scores, xy = edge_step(local_m, distance_m, slope, window_m, blur_m)
+    total = np.zeros(3)
+    for i in range(3):
+        information[i, i] += 1e5 if i >= 1 else 1e1
         for k in range(len(scores)):
             total[i] += scores[k, i]
     step = solved(information, total)
     share = min(1.0, LONGEST_STEP_M / max(abs(step[1]), abs(step[2]), 1e-12))
-    for i in range(count):
+    for i in range(3):
         step[i] *= share
     return step, (information, scores, xy)
 
@@ -292,7 +287,7 @@ def round_step(
     for k in range(count):
         balance[k] = 1.0 / max(crowd[k], FULL_SQUARE)
     face = face_steps(inside, balance, widths_m, held, bow_m, half_m, columns)
-    return face, inside, edge_move(local, distance, slope, window_m, blur_m, 3), astray / max(total, 1)
+    return face, inside, edge_move(local, distance, slope, window_m, blur_m), astray / max(total, 1)
 
 
 @compiled
@@ -313,32 +308,3 @@ def laid_flat(points_m, rotation, origin_m, camera_m, half_m, bow_m):
         for i in range(3):
             flat[k, i] = points_m[k, i] - drop * rotation[i, 2]
     return flat
-
-
-@compiled
-def stretched(xy_m, low_m, cell_m, shape, table):
-    """Yaw, shifts and stretch (5,) with which places (N, 2) agree best, and what `edge_step` gives there.
-
-    Where that ends among other slots, too little is seen to tell: then it is what the first step says.
-    """
-    moved, places, still, origin_m = np.zeros(5), np.zeros((len(xy_m), 3)), np.zeros((3, 3)), np.zeros(3)
-    for i in range(3):
-        still[i, i] = 1.0
-    for turn in range(STRETCH_ROUNDS):
-        for k in range(len(xy_m)):
-            x, y = xy_m[k, 0] - moved[1], xy_m[k, 1] - moved[2]
-            places[k, 0] = (x + moved[0] * y) / (1.0 + moved[3])
-            places[k, 1] = (y - moved[0] * x) / (1.0 + moved[4])
-        local, distance, slope = laid(places, still, origin_m, np.inf, low_m, cell_m, shape, table)
-        step, edges = edge_move(local, distance, slope, np.inf, STRETCH_BLUR_M, 5)
-        # Far from the middle a stretch moves edges as a shift does: no step is longer than edges are seen from.
-        farthest = 0.5 * cell_m * max(abs(step[3]) * shape[0], abs(step[4]) * shape[1])
-        for i in range(5):
-            moved[i] += step[i] * min(1.0, LONGEST_STEP_M / max(farthest, 1e-12))
-        if turn == 0:
-            first, first_edges = moved.copy(), edges
-        if max(abs(moved[3]), abs(moved[4])) > LOST_STRETCH:
-            return first, first_edges
-        if max(abs(step[3]), abs(step[4])) < SETTLED_STRETCH:
-            break
-    return moved, edges

@@ -1,4 +1,4 @@
-"""Which rack of a catalogue stands there (`--rack auto`): every rack is registered, and the evidence compared."""
+"""Which rack of a catalogue stands there (`--rack auto`): every rack is registered, and the likelihoods compared."""
 
 from __future__ import annotations
 
@@ -28,12 +28,12 @@ class RankedRack:
 
     Attributes:
         rack: The rack.
-        evidence: How much likelier the points are with it than without any, nats; 0 without a registration.
+        log_likelihood: Of the cells of its face, nats; minus infinity without a registration.
         reason: Why it is refused; empty if it fits.
     """
 
     rack: RackModel
-    evidence: float
+    log_likelihood: float
     reason: str
 
 
@@ -51,9 +51,9 @@ def name_rack(
 ) -> tuple[RackPose, tuple[RankedRack, ...]]:
     """Find out which rack stands there, and its pose (always by method ``edges``).
 
-    A rack is named if it passes every test of `register_rack`, and its evidence is `rack.min_rival_ratio` times that of
-    the next rack that passes them too. `RackPose.rack` is the rack, `named_by_margin` how much its evidence beats that
-    of the next rack that passes, as a share of its own: 0 is no difference, 1 is that no other rack passes.
+    A rack is named if it passes every check of `register_rack`, and is likelier than the next rack that passes them too
+    by `rack.max_gain` nats. `RackPose.rack` is the rack, `named_by_nats` by how much it is likelier: infinity where no
+    other passes.
 
     Args:
         points_m: Array of shape (N, 3), camera frame, metres, without NaN: the rack's box or the whole frame.
@@ -70,7 +70,7 @@ def name_rack(
         reason = f"{len(points_m)} valid points on the rack, expected at least {MIN_POINTS}"
         return RackPose(RackStatus.INSUFFICIENT, reason, code="too_few_points"), ()
     order = sorted(_registrations(points_m, racks, config), key=lambda pair: _rank(pair[1]))
-    ranking = tuple(RankedRack(rack, best.agreement.evidence, best.reason) for rack, best in order)
+    ranking = tuple(RankedRack(rack, best.log_likelihood, best.reason) for rack, best in order)
     reason = _not_named(ranking, len(racks), config)
     if reason:
         doubt = unit_doubt(points_m)
@@ -82,7 +82,7 @@ def name_rack(
     if hint is not None and not rack.has_slot(hint.slot):
         hint = None
     pose = pose_of(best, points_m, rack, config, hint, intrinsics)
-    return replace(pose, rack=rack, named_by_margin=1 - _rival(ranking) / ranking[0].evidence), ranking
+    return replace(pose, rack=rack, named_by_nats=ranking[0].log_likelihood - _rival(ranking)), ranking
 
 
 def _not_named(ranking: Sequence[RankedRack], known: int, config: Config) -> str:
@@ -94,15 +94,19 @@ def _not_named(ranking: Sequence[RankedRack], known: int, config: Config) -> str
             f"{f'the nearest are {near}' if near else 'no level top is among the points'}; "
             "give your own by --rack FILE, or --rack grid with --pitch and --slot"
         )
-    if ranking[0].evidence >= config.rack.min_rival_ratio * _rival(ranking):
+    ahead = ranking[0].log_likelihood - _rival(ranking)
+    if ahead >= config.rack.max_gain:
         return ""
-    told = ", ".join(f"{entry.rack.name} ({entry.evidence:.0f} nats)" for entry in ranking[:TOLD])
-    return f"more than one rack fits: {told}; a ratio of {config.rack.min_rival_ratio:g} expected: name it"
+    told = ", ".join(entry.rack.name for entry in ranking[:TOLD])
+    return (
+        f"more than one rack fits: {told}, the first one likelier by {ahead:.0f} nats, at least "
+        f"{config.rack.max_gain:g} expected: name it"
+    )
 
 
 def _rival(ranking: Sequence[RankedRack]) -> float:
-    """Evidence of the next rack after the first that passes every test; 0 without any."""
-    return max((entry.evidence for entry in ranking[1:] if not entry.reason), default=0.0)
+    """Log likelihood of the next rack after the first that passes every check; minus infinity without any."""
+    return max((entry.log_likelihood for entry in ranking[1:] if not entry.reason), default=float("-inf"))
 
 
 def _registrations(
@@ -122,6 +126,6 @@ def _registrations(
     return [(rack, best[rack.name]) for rack in racks if rack.name in best]
 
 
-def _rank(registration: Registration) -> tuple[bool, float]:
-    """Smaller is better: accepted before refused, then more evidence."""
-    return bool(registration.reason), -registration.agreement.evidence
+def _rank(registration: Registration) -> tuple[bool, float, float]:
+    """Smaller is better: accepted before refused, then likelier, then more evidence."""
+    return bool(registration.reason), -registration.log_likelihood, -registration.agreement.evidence

@@ -51,12 +51,12 @@ class RackPose:
         size: What the sizes of its face are measured to be; None from a method that does not measure them.
         floor_m: Height at which the slots' floor is seen above the rack's base and its standard deviation, metres; None
             where it is not seen.
-        bow_m: How much higher the face is than the plane at its centre, shape (3,), metres: at the ends of its x axis, of
-            its y axis, and what its corners have besides: b(x, y) = bow_x u^2 + bow_y v^2 + bow_xy u v, u = 2 x / length, v =
-            2 y / width. None without a pose, and from a method that takes every face for flat.
+        bow_m: How much higher the face is than the plane at its centre, shape (3,), metres: at the ends of its x axis,
+            of its y axis, and what its corners have besides: b(x, y) = bow_x u^2 + bow_y v^2 + bow_xy u v, u = 2 x /
+            length, v = 2 y / width. None without a pose, and from a method that takes every face for flat.
         bow_std_m: Standard deviations of that, shape (3,).
-        named_by_margin: By how much the rack's agreement beats the next one's of the catalogue, where the rack was
-            named by that: 0 is no difference; NaN otherwise.
+        named_by_nats: By how much likelier the rack is than the next one of the catalogue that passes every check,
+            where it was named by that; infinity where no other passes, NaN where a person named it.
         code: Why there is no pose where no check says it: ``too_few_points``, ``no_level_band``, ``too_coarse``,
             ``too_noisy``, ``wrong_unit``, ``no_detection``, ``other_outline``, ``other_fit`` (of `obb-icp`),
             ``none_fits``, ``several_fit`` (of `--rack auto`), ``no_slots`` (of `--rack grid`).
@@ -75,7 +75,7 @@ class RackPose:
     spacing_m: float = float("nan")
     covariance: FloatArray | None = None
     rack: RackModel | None = None
-    named_by_margin: float = float("nan")
+    named_by_nats: float = float("nan")
     hint_note: str = ""
     level_tops: int = 0
     checks: tuple[Check, ...] = ()

@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import dataclass
 
 import numpy as np
 
-from tubepose.checks import Check, failed
+from tubepose.checks import Check
 from tubepose.config import RackConfig
 from tubepose.labware import RackModel
+from tubepose.preprocessing import thin
 from tubepose.rack.agreement import Agreement
-from tubepose.rack.alternatives import SIDES, edge_slots, gains, line_steps_m
+from tubepose.rack.alternatives import SIDES, edge_slots, gains, line_steps_m, own_distance_m
 from tubepose.rack.face import Face, face_grid, look_at_face
 from tubepose.rack.field import openings_field
 from tubepose.rack.fit import Fit, to_frame, top_frame
@@ -30,6 +32,7 @@ LOST_DEG = 45.0
 CORE, FULL = 0.25, 0.6
 # A floor is seen in slots with so many points, this near to each other in height, away from walls and from the face.
 FLOOR_POINTS = 12
+FLOOR_SAMPLE = 60_000
 FLAT_M = 0.8e-3
 WALL_M = 2.5e-3
 DEEP_M = 6e-3
@@ -38,10 +41,38 @@ FLOOR_SLOTS = 3
 FLOOR_STD_M = 0.3e-3
 
 
-def prove(
-    points_m: FloatArray, fit: Fit, seen: Agreement, rack: RackModel, config: RackConfig
-) -> tuple[tuple[Check, ...], FaceSize | None, tuple[float, float] | None]:
-    """Every check of a registration, the sizes of its face, and its floor; without them where a quick look fails.
+@dataclass(frozen=True, slots=True, eq=False)
+class Proof:
+    """What became of a registration.
+
+    Attributes:
+        checks: What it had to pass besides the quick looks.
+        size: Sizes of its face.
+        floor_m: Height of the slots' floor above the rack's base and its standard deviation, metres; None where it was
+            not seen.
+        log_likelihood: Of the cells of its face and beside it, nats.
+    """
+
+    checks: tuple[Check, ...]
+    size: FaceSize
+    floor_m: tuple[float, float] | None
+    log_likelihood: float
+
+
+def quick_checks(seen: Agreement, fit: Fit, config: RackConfig) -> tuple[Check, ...]:
+    """What a registration has to pass before its face is looked at cell by cell."""
+    return tuple(_quick(seen, fit, config))
+
+
+def face_of(points_m: FloatArray, fit: Fit, spacing_m: float, rack: RackModel) -> Face:
+    """The face of a registration; arguments as of `prove`."""
+    window_m = float(np.clip(FACE_SIGMAS * fit.scatter_m, *FACE_M))
+    grid = face_grid(rack, spacing_m, BESIDE_M)
+    return look_at_face(points_m, fit.T_camera_rack, rack, window_m, grid, spacing_m)
+
+
+def prove(points_m: FloatArray, fit: Fit, seen: Agreement, rack: RackModel, config: RackConfig) -> Proof:
+    """Every check of a registration that has passed the quick ones, and what its face was measured to be.
 
     Args:
         points_m: Points near the rack, camera frame, shape (N, 3), metres; of a bowed rack those that were laid flat.
@@ -50,23 +81,18 @@ def prove(
         rack: The rack.
         config: Limits.
     """
-    checks = tuple(_quick(seen, fit, config))
-    if failed(checks):
-        return checks, None, None
-    window_m = float(np.clip(FACE_SIGMAS * fit.scatter_m, *FACE_M))
-    grid = face_grid(rack, seen.spacing_m, BESIDE_M)
-    face = look_at_face(points_m, fit.T_camera_rack, rack, window_m, grid, seen.spacing_m)
-    tops = tops_in_slots(points_m, top_frame(fit.T_camera_rack, rack), fit.bow_m, rack)
-    size = measure_size(face, rack).with_tops(tops)
-    distance_m = float(np.linalg.norm(top_frame(fit.T_camera_rack, rack)[:3, 3]))
-    checks += (
+    face, T_camera_top = face_of(points_m, fit, seen.spacing_m, rack), top_frame(fit.T_camera_rack, rack)
+    tops = tops_in_slots(points_m, T_camera_top, fit.bow_m, rack)
+    size, floor_m = measure_size(face, rack).with_tops(tops), measure_floor(points_m, fit, rack)
+    checks = (
         *_alternatives(face, rack, config),
         *_beside(face, rack),
         *_tops(tops, config),
         *_sizes(size, rack, config),
+        *_scale(size, rack, float(np.linalg.norm(T_camera_top[:3, 3])), config),
+        *_floor(floor_m, rack, config),
     )
-    floor_m = measure_floor(points_m, fit, rack)
-    return (*checks, *_scale(size, rack, distance_m, config), *_floor(floor_m, rack, config)), size, floor_m
+    return Proof(checks, size, floor_m, face.log_likelihood(own_distance_m(rack, face.grid)))
 
 
 def _quick(seen: Agreement, fit: Fit, config: RackConfig) -> Iterator[Check]:
@@ -121,7 +147,7 @@ def _beside(face: Face, rack: RackModel) -> Iterator[Check]:
 
 def _tops(tops: TopsInSlots, config: RackConfig) -> Iterator[Check]:
     if tops.count >= LEAST_TOPS:
-        yield Check("tops_off_slots", tops.rms_share, config.max_tops_off, tops.rms_share <= config.max_tops_off)
+        yield Check("tops_off_slots", tops.median_share, config.max_tops_off, tops.median_share <= config.max_tops_off)
 
 
 def _sizes(size: FaceSize, rack: RackModel, config: RackConfig) -> Iterator[Check]:
@@ -170,7 +196,7 @@ def measure_floor(points_m: FloatArray, fit: Fit, rack: RackModel) -> tuple[floa
     In every slot the points away from its walls whose heights are alike are a floor; the median of the slots that have
     one is taken, if they agree.
     """
-    local = to_frame(points_m, top_frame(fit.T_camera_rack, rack))
+    local = to_frame(thin(points_m, FLOOR_SAMPLE), top_frame(fit.T_camera_rack, rack))
     distance, _, known = openings_field(rack).look_up(local)
     deep = local[known & (local[:, 2] < -DEEP_M) & (distance > WALL_M)]
     if len(deep) < FLOOR_POINTS:

@@ -7,7 +7,7 @@ says "the view through the top is free there", a point above says nothing.
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy import fft
@@ -17,7 +17,7 @@ from tubepose.labware import RackModel
 from tubepose.preprocessing import fit_plane
 from tubepose.rack import view_kernels
 from tubepose.rack.field import PICTURE_M, TURNS, picture, picture_spectrum, solid_signature, top_field, turn_signature
-from tubepose.transforms import FloatArray, make_transform
+from tubepose.transforms import FloatArray, make_transform, translation
 
 # Points that planes are drawn from and judged by, and how many planes are drawn: a top of a tenth of the points is
 # drawn twice; planes of rims, caps, floors and the table are as level, and help.
@@ -40,6 +40,9 @@ LEAST_SHARE = 0.12
 # Pictures of more than 1.6 m are not searched: no capture that shows ribs is as wide.
 MOST_CELLS = 800
 CLEAR_SHARE = 0.3
+# Where tops hide a rack: angles that are tried, how far below them its face may be, and heights of it that are.
+MOST_TOP_TURNS = 6
+DEEPEST_M, HEIGHT_BIN_M, TOP_HEIGHTS = 0.12, 1e-3, 2
 # Points that a band's plane is fitted to, those that they are chosen from, those that tell where a picture ends, and
 # free ones that it is made of.
 PLANE_POINTS = 2000
@@ -228,7 +231,50 @@ class Turn:
     strength: float
 
 
-def turns(band: Band, rack: RackModel, count: int) -> list[Turn]:
+def search_by_tops(found_levels: Iterable[list[Band]], points_m: FloatArray, rack: RackModel) -> Iterator[Hypothesis]:
+    """Poses that a rack could have whose tubes hide it: where their tops lie as its slots do, and ribs show below.
+
+    Args:
+        found_levels: Bands of `levels`.
+        points_m: The points that they are of, camera frame, shape (N, 3), metres.
+        rack: The rack.
+    """
+    for level in found_levels:
+        found = [turn for band in level for turn in turns(band, rack, TURN_TRIES, tops=True)]
+        found.sort(key=lambda turn: -turn.strength)
+        placed = [hypothesis for turn in found[:MOST_TOP_TURNS] for hypothesis in place(turn, rack, tops=True)]
+        placed = [hypothesis for hypothesis in placed if hypothesis.share > LEAST_SHARE]
+        for hypothesis in sorted(placed, key=lambda hypothesis: -hypothesis.worth)[:BEST_PLACED]:
+            for height_m in _heights_below(points_m, hypothesis.T_camera_rack, rack):
+                T = hypothesis.T_camera_rack @ translation([0.0, 0.0, height_m])
+                yield replace(hypothesis, T_camera_rack=T)
+
+
+def _heights_below(points_m: FloatArray, T_camera_rack: FloatArray, rack: RackModel) -> FloatArray:
+    """Where a face shows below tops, the likeliest first: how far below, (K,), negative, metres.
+
+    At the height of the face points lie on its solid part; bodies of tubes lie in its openings.
+    """
+    T = T_camera_rack @ translation([0.0, 0.0, rack.height_m])
+    local = (points_m - T[:3, 3]) @ T[:3, :3]
+    local = local[(local[:, 2] > -DEEPEST_M) & (local[:, 2] < -BELOW_M)]
+    distance, _, known = top_field(rack).look_up(local)
+    edges = np.arange(-DEEPEST_M, 0.0, HEIGHT_BIN_M)
+    solid, opened = (
+        np.histogram(local[known & part, 2], edges)[0].astype(float) for part in (distance < 0, distance > HEIGHT_BIN_M)
+    )
+    score = np.convolve(solid - opened, [0.5, 1.0, 1.0, 1.0, 0.5], "same")
+    best = []
+    for _ in range(TOP_HEIGHTS):
+        k = int(score.argmax())
+        if score[k] <= 0:
+            break
+        best.append(edges[k] + HEIGHT_BIN_M / 2)
+        score[max(k - 4, 0) : k + 5] = -np.inf
+    return np.array(best)
+
+
+def turns(band: Band, rack: RackModel, count: int, *, tops: bool = False) -> list[Turn]:
     """Angles of the rack's x axis in a band (modulo half a turn), the best first, by the strength of its waves."""
     low, size = _frame(band.solid_m, np.eye(2), rack, padded=False)
     if size > MOST_CELLS:
@@ -236,7 +282,7 @@ def turns(band: Band, rack: RackModel, count: int) -> list[Turn]:
     image = view_kernels.cell_counts(band.solid_m, np.eye(2), low, PICTURE_M, size)
     signature = turn_signature(fft.rfft2(np.minimum(image, np.float32(view_kernels.median_count(image)))), size)
     norm = float(np.linalg.norm(signature))
-    match = fft.irfft((fft.rfft(signature, axis=0) * solid_signature(rack)).sum(axis=1), TURNS) / max(norm, 1e-12)
+    match = fft.irfft((fft.rfft(signature, axis=0) * solid_signature(rack, tops)).sum(axis=1), TURNS) / max(norm, 1e-12)
     found = []
     for _ in range(count):
         best = int(match.argmax())
@@ -265,7 +311,7 @@ def _ends(points_m: FloatArray) -> tuple[FloatArray, FloatArray]:
     return low, high
 
 
-def place(turn: Turn, rack: RackModel) -> list[Hypothesis]:
+def place(turn: Turn, rack: RackModel, *, tops: bool = False) -> list[Hypothesis]:
     """Where the picture of the top lies best at one angle; for a top that half a turn changes, both ways round."""
     cos, sin = np.cos(turn.angle_rad), np.sin(turn.angle_rad)
     T_turned = np.array([[cos, -sin], [sin, cos]])
@@ -281,7 +327,7 @@ def place(turn: Turn, rack: RackModel) -> list[Hypothesis]:
     half = np.array(picture(rack).shape) // 2
     found = []
     for half_turn in (False, True) if top_field(rack).alike == 1 else (False,):
-        match = fft.irfft2(spectrum * picture_spectrum(rack, size, half_turn), (size, size))
+        match = fft.irfft2(spectrum * picture_spectrum(rack, size, half_turn, tops), (size, size))
         i, j = np.unravel_index(int(match.argmax()), match.shape)
         center = low + (np.array([i, j]) + 0.5) * PICTURE_M
         R = np.eye(3)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -11,9 +11,10 @@ from tubepose.checks import Check, reason
 from tubepose.config import RackConfig
 from tubepose.labware import RackModel
 from tubepose.rack.agreement import Agreement, coverage, measure_agreement
+from tubepose.rack.alternatives import own_distance_m
 from tubepose.rack.fit import HOPELESS_SHARE, Fit, RoughFit, at_the_top, leveled, refine, top_frame
 from tubepose.rack.looks import SLOT_STEPS, look_at, on_lattice
-from tubepose.rack.proof import prove
+from tubepose.rack.proof import face_of, prove, quick_checks
 from tubepose.rack.size import FaceSize
 from tubepose.rack.tops import Level, level_by_tops
 from tubepose.transforms import FloatArray, translation
@@ -35,6 +36,7 @@ class Registration:
         name: Of the rack.
         size: What the face's sizes are measured to be; None where a quick look had failed.
         floor_m: Height of the slots' floor and its standard deviation, metres; None where it was not seen.
+        log_likelihood: Of the cells of the face, nats; minus infinity where a quick look had failed.
     """
 
     fit: Fit
@@ -43,6 +45,7 @@ class Registration:
     name: str
     size: FaceSize | None = None
     floor_m: tuple[float, float] | None = None
+    log_likelihood: float = float("-inf")
 
     @property
     def reason(self) -> str:
@@ -80,7 +83,7 @@ def settled(
         if farther.agreement.evidence <= seen.evidence:
             break
         best = farther
-    return best
+    return _proved(best, near_m, rack, config)
 
 
 def _judged(near_m: FloatArray, rough: RoughFit, rack: RackModel, config: RackConfig) -> Registration:
@@ -116,7 +119,30 @@ def _leans(fit: Fit, level: Level, rack: RackModel) -> bool:
 
 def _refined(near_m: FloatArray, rough: RoughFit, rack: RackModel, config: RackConfig) -> Registration:
     fit = refine(rough, rack)
-    flat_m = fit.laid_flat(near_m, rack)
-    agreement = measure_agreement(flat_m, fit, rack, config)
-    checks, size, floor_m = prove(flat_m, fit, agreement, rack, config)
-    return Registration(fit, agreement, checks, rack.name, size, floor_m)
+    agreement = measure_agreement(fit.laid_flat(near_m, rack), fit, rack, config)
+    return Registration(fit, agreement, quick_checks(agreement, fit, config), rack.name)
+
+
+def _proved(registration: Registration, near_m: FloatArray, rack: RackModel, config: RackConfig) -> Registration:
+    """A registration that has passed the quick looks, with the other checks."""
+    if registration.reason:
+        return registration
+    fit = registration.fit
+    proof = prove(fit.laid_flat(near_m, rack), fit, registration.agreement, rack, config)
+    return replace(
+        registration, checks=(*registration.checks, *proof.checks), size=proof.size, floor_m=proof.floor_m,
+        log_likelihood=proof.log_likelihood,
+    )  # fmt: skip
+
+
+def likelihood_at(points_m: FloatArray, T_camera_rack: FloatArray, rack: RackModel, config: RackConfig) -> float:
+    """Log likelihood of the cells of a rack's face, registered from a coarse pose, nats.
+
+    Minus infinity where it does not fit. Arguments are those of `register_at`.
+    """
+    near_m, rough = on_lattice(points_m, T_camera_rack, rack)
+    best = _judged(near_m, rough, rack, config)
+    if best.reason:
+        return float("-inf")
+    face = face_of(best.fit.laid_flat(near_m, rack), best.fit, best.agreement.spacing_m, rack)
+    return face.log_likelihood(own_distance_m(rack, face.grid))

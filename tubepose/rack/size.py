@@ -21,7 +21,7 @@ from tubepose.rack.tops_in_slots import TopsInSlots
 from tubepose.transforms import FloatArray
 
 # Blurs of the rounds, and how many rounds each has: the first reaches over the width of a rib.
-BLURS_M = np.array([1.5e-3, 0.8e-3, 0.4e-3])
+BLURS_M = np.array([1.2e-3, 0.4e-3])
 ROUNDS = 3
 # What the unknowns may be, standard deviations, and how far one step of the scoring goes.
 PRIOR_STD = np.array([5e-3, 0.7e-3, 0.7e-3, 0.03, 0.03, 1.5e-3, 1.5e-3, 1.5e-3])
@@ -118,7 +118,7 @@ def measure_size(face: Face, rack: RackModel) -> FaceSize:
     xy, inner, outline = face.grid.centers_m, openings_field(rack), outline_field(rack)
     own_m = own_distance_m(rack, face.grid)
     rates = face.rates(own_m)
-    missed = np.where(face.seen, 0.0, np.take(rates.hidden, face.shaded.astype(np.intp)))
+    missed = np.where(face.seen, 0.0, np.take(rates.hidden, face.zones))
     told = face.seen | (face.nothing & ~_patchy(face, own_m))
     near = told & np.all(np.abs(xy) < rack.outline_m / 2 + REACH_M, axis=-1)
     if rates.hidden[1] > MOST_HIDDEN:

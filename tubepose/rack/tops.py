@@ -120,7 +120,7 @@ def _surface(uv: FloatArray, heights_m: FloatArray) -> tuple[FloatArray, FloatAr
 
     The bow has the prior of a rack's face.
     """
-    fits = []
+    fits: list[tuple[FloatArray, FloatArray, FloatArray]] = []
     for bowed in (True, False):
         design = _terms(uv)
         prior = np.diag([0, 0, 0, *np.full(3, (ALIKE_M / (2 * BOW_STD_M)) ** 2 if bowed else 1e9)])
@@ -129,15 +129,15 @@ def _surface(uv: FloatArray, heights_m: FloatArray) -> tuple[FloatArray, FloatAr
         off = heights_m - design @ found
         spare = max(len(off) - (6 if bowed else 3), 1)
         covariance = INFLATE**2 * float(off @ off) / spare * np.linalg.inv(normal)
-        fits.append((np.asarray(found), np.asarray(covariance), off))
+        fits.append((np.asarray(found), np.asarray(covariance), np.asarray(off)))
     bowed_fit, flat_fit = fits
     bow = bowed_fit[0][3:]
     significant = bow @ np.linalg.solve(bowed_fit[1][3:, 3:], bow) > FLAT_CHI2
     if significant:
         return bowed_fit
-    found, covariance, off = flat_fit
+    flat, covariance, off = flat_fit
     covariance[3:, 3:] = bowed_fit[1][3:, 3:]
-    return np.concatenate([found[:3], np.zeros(3)]), covariance, off
+    return np.concatenate([flat[:3], np.zeros(3)]), covariance, off
 
 
 def _rows_differ(centers_m: FloatArray, off_m: FloatArray) -> bool:

@@ -39,14 +39,14 @@ class TopsInSlots:
 
     Attributes:
         count: How many there are.
-        rms_share: How far their middles lie from the slots' centres, root of the mean square, as a share of the distance
-            of slots; NaN without any.
+        median_share: How far their middles lie from the slots' centres, median, as a share of the distance of slots;
+            NaN without any.
         stretch: By how much they lie farther apart than the slots along x and y, shape (2,); 0 where they tell none.
         std: Standard deviations of that, shape (2,); infinite where they tell none.
     """
 
     count: int
-    rms_share: float
+    median_share: float
     stretch: FloatArray
     std: FloatArray
 
@@ -78,9 +78,9 @@ def tops_in_slots(points_m: FloatArray, T_camera_top: FloatArray, bow_m: FloatAr
     if not found:
         return TopsInSlots(0, float("nan"), np.zeros(2), np.full(2, np.inf))
     off, share = np.array(offsets), np.array(offsets) / pitches[found][:, None]
-    rms = float(np.sqrt((share**2).sum(axis=1).mean()))
+    median = float(np.median(np.hypot(*share.T)))
     measured = [_stretch(centers[found], off, axis) for axis in range(2)]
-    return TopsInSlots(len(found), rms, np.array([m[0] for m in measured]), np.array([m[1] for m in measured]))
+    return TopsInSlots(len(found), median, np.array([m[0] for m in measured]), np.array([m[1] for m in measured]))
 
 
 def _middle(apart_m: FloatArray, heights_m: FloatArray, pitch_m: float) -> FloatArray | None:

@@ -203,27 +203,37 @@ def crossed(points_m, step, rotation, origin_m, camera_m):
 
 
 @compiled
-def cell_logs(solid, nothing, standing, shaded, part_m, rows, hidden, dark, stray, crossed, wrong, shift_m, blur_m):
-    """Log likelihoods (K,) of some cells `rows` (K,), each at a distance from the solid part, (K,); see `Face`.
+def gained(kinds, shares, rows, other, own, tables, nothing_tables, square, missed):
+    """How much likelier cells `rows` (K,) are with other chances of being solid than with their own, (K,) levels each.
 
-    `solid` is the share of points at the face's height, NaN without any; `hidden` and `dark` are rates of cells without
-    a return away from what stands up and beside it, (2,) each.
+    Chances are levels of `tables` (8, 2, L): log likelihoods by kind of cell, of being solid and of being open, and of
+    `nothing_tables` (4, L), by zone. `kinds` says what a cell is: its row of `tables`, 8 more for nothing in a zone, 16
+    for no news. What cells without a return gain is added to `missed`, by their square; the rest is returned.
     """
-    found = np.zeros(len(rows))
+    total = 0.0
     for k in range(len(rows)):
         row = rows[k]
-        share = solid[row]
-        seen = share == share
-        if not seen and not nothing[row]:
-            continue
-        eta = (shift_m - part_m[k]) / blur_m
-        s = 1.0 / (1.0 + math.exp(-min(max(eta, -30.0), 30.0)))
-        zone = 1 if shaded[row] else 0
-        none = s * hidden[zone] + (1.0 - s) * dark[zone]
-        if not seen:
-            found[k] = math.log(none)
-            continue
-        other = crossed if standing[row] else stray
-        shown = other + (1.0 - wrong - other) * s
-        found[k] = math.log(1.0 - none) + share * math.log(shown) + (1.0 - share) * math.log(1.0 - shown)
-    return found
+        kind = kinds[row]
+        if kind < 8:
+            share = shares[row]
+            table = tables[kind]
+            solid = table[0, other[k]] - table[0, own[row]]
+            total += share * solid + (1.0 - share) * (table[1, other[k]] - table[1, own[row]])
+        elif kind < 16:
+            zone = kind - 8
+            missed[square[row]] += nothing_tables[zone, other[k]] - nothing_tables[zone, own[row]]
+    return total
+
+
+@compiled
+def whole(kinds, shares, own, tables, nothing_tables):
+    """Log likelihood of all cells, each with its chance of being solid; arguments as of `gained`."""
+    total = 0.0
+    for row in range(len(kinds)):
+        kind = kinds[row]
+        if kind < 8:
+            share = shares[row]
+            total += share * tables[kind, 0, own[row]] + (1.0 - share) * tables[kind, 1, own[row]]
+        elif kind < 16:
+            total += nothing_tables[kind - 8, own[row]]
+    return total

@@ -8,8 +8,8 @@ import numpy as np
 
 from tubepose.config import SensorConfig
 
-TABLE, RACK_TOP, PRIOR = "table", "rack_top", "prior"
-"""Where a number is from: the level surface beside the rack, the solid part of its top, or an assumption."""
+TABLE, RACK_TOP, CAPS, PRIOR = "table", "rack_top", "caps", "prior"
+"""Where a number is from: the level surface beside the rack, the solid part of its top, caps, or an assumption."""
 
 
 @dataclass(frozen=True, slots=True)
