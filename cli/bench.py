@@ -15,8 +15,9 @@ if TYPE_CHECKING:
 
     import pandas as pd
 
-    from tubepose.batch import Job, Tables
+    from tubepose.batch import Job
     from tubepose.config import Config
+    from tubepose.result_tables import Tables
     from tubepose_cli.truth import MeasuredTruth
 
 ALL_METHODS = "upright,profile,paper,slot-icp,global-icp"

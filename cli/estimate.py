@@ -12,8 +12,9 @@ import typer
 from tubepose_cli.paths import named
 
 if TYPE_CHECKING:
-    from tubepose.batch import Job, Tables, UnnamedJob
+    from tubepose.batch import Job, UnnamedJob
     from tubepose.records import Row
+    from tubepose.result_tables import Tables
 
 MOST_NAMED = 5
 """Captures that one line names."""

@@ -7,11 +7,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from tubepose.batch import DetectorFactory, Job, Tables, UnnamedJob
+    from tubepose.batch import DetectorFactory, Job, UnnamedJob
     from tubepose.config import Config
     from tubepose.labware import Labware
     from tubepose.pipeline import Scene, TubeEstimate
     from tubepose.records import Row
+    from tubepose.result_tables import Tables
 
 
 JUDGED_FILES = (
@@ -49,11 +50,12 @@ def run_estimates(
     Raises:
         StoppedError: The user stopped the run. What was done by then is written; nothing where nothing was done.
     """
-    from tubepose.batch import Tables, run_jobs
+    from tubepose.batch import run_jobs
     from tubepose.errors import StoppedError
     from tubepose.labware_check import pooled_rows
     from tubepose.provenance import inputs_sha256, pinned_threads, run_record
     from tubepose.report.writing import make_folder, remove_files, write_json
+    from tubepose.result_tables import Tables
     from tubepose_cli.show import describe_noise, describe_sizes, progress, say, say_when_compiling
 
     taken: dict[str, tuple[str, ...]] = {}

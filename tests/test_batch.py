@@ -11,7 +11,7 @@ import pytest
 import scenes
 
 from tubepose import batch
-from tubepose.batch import MOST_ASKED, Job, Tables, UnnamedJob, run_jobs, session_jobs, trial_capture
+from tubepose.batch import MOST_ASKED, Job, UnnamedJob, run_jobs, session_jobs, trial_capture
 from tubepose.capture.frame import RgbdFrame
 from tubepose.capture.hints import SlotHint
 from tubepose.capture.session import Session, load_session
@@ -22,6 +22,7 @@ from tubepose.errors import CaptureError, DetectorError
 from tubepose.labware import load_rack, load_tube
 from tubepose.rack import RackPose, RackStatus
 from tubepose.records import ESTIMATE_COLUMNS, RACK_COLUMNS, SENSOR_COLUMNS, SLOT_COLUMNS, TIMING_COLUMNS, to_table
+from tubepose.result_tables import Tables
 from tubepose.transforms import HALF_TURN, transform_points
 
 CONFIG = Config()
@@ -354,7 +355,7 @@ def test_captures_after_the_first_stand_as_it_did(place: SlotHint) -> None:
     tables = run(*jobs)
     assert resolved(tables) == ["hint", "previous"]
     assert not any(row["ambiguous"] for rows in (tables.racks, tables.slots, tables.estimates) for row in rows)
-    filled = [row["slot"] for row in tables.slots if row["occupied"]]
+    filled = [row["slot"] for row in tables.slots if row["state"] == "occupied"]
     assert filled == (["B2"] if place is A1 else ["B3"]) * 2
 
 

@@ -9,19 +9,18 @@ from tubepose.checks import Check
 from tubepose.config import Config
 from tubepose.labware import load_rack, load_tube
 from tubepose.labware_check import (
-    LEAST_TOPS,
     TOLERANCE_MM,
     SizeCheck,
     compare_sizes,
     pooled,
     pooled_rows,
-    refuse_by_tops,
     size_row,
 )
 from tubepose.rack import RackPose, RackStatus
 from tubepose.rack.size import FaceSize
 from tubepose.scene import Scene, TubeEstimate, TubeTarget
 from tubepose.tube import TopMeasure, TubePose, TubeStatus
+from tubepose.tubes_pitch import LEAST_TOPS, refuse_by_tops
 from tubepose_cli.show import describe_sizes
 
 CONFIG = Config()

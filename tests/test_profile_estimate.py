@@ -206,7 +206,8 @@ def test_an_uncertain_rack_makes_uncertain_tubes(frame, found):
         assert a.pose.T_rack_tube == pytest.approx(b.pose.T_rack_tube, abs=5e-6)
         assert np.linalg.eigvalsh(a.pose.covariance - b.pose.covariance).min() > -1e-12
         assert a.pose.covariance[4, 4] > b.pose.covariance[4, 4] + (2e-4) ** 2
-        assert a.pose.confidence <= b.pose.confidence
+        # Two samples: what the others do not tell apart.
+        assert a.pose.confidence <= b.pose.confidence + 1e-3
 
 
 # Frames without pixels

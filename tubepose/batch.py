@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
@@ -19,13 +19,15 @@ from tubepose.compiled import compilations
 from tubepose.config import Config
 from tubepose.detection import Detector
 from tubepose.errors import CaptureError, TubePoseError, is_interrupt, kept
-from tubepose.labware import Labware, RackModel, TubeModel
-from tubepose.labware_check import compare_sizes, refuse_by_tops, size_row
+from tubepose.labware import RackModel, TubeModel
+from tubepose.labware_check import compare_sizes, size_row
 from tubepose.pipeline import DEFAULT_METHOD, STOCHASTIC, Scene, StageTime, TubeEstimate, estimate_tubes, prepare_scene
 from tubepose.rack import RackPose, RackStatus
 from tubepose.rack.turns import EarlierTurns
 from tubepose.records import Row, check_rows, estimate_row, rack_pose_row, rack_row, sensor_row, slot_rows, timing_row
+from tubepose.result_tables import Tables
 from tubepose.transforms import FloatArray
+from tubepose.tubes_pitch import refuse_by_tops
 
 DetectorFactory = Callable[[RackModel, tuple[TubeModel, ...]], Detector]
 RackFinder = Callable[[RgbdFrame], RackPose]
@@ -88,47 +90,6 @@ class UnnamedJob:
 
 MOST_WARMED = 5
 """Frames of one kind that are run twice at most where none has a tube."""
-
-
-@dataclass(slots=True)
-class Tables:
-    """Rows of the result files, in the order in which they came.
-
-    Attributes:
-        racks: One per frame and method.
-        sensor: One per frame.
-        slots: One per frame, method and slot.
-        estimates: One per frame, method, seed and detected tube.
-        timings: One per timed stage instance.
-        checks: One per check of a rack or of a tube, frame and method.
-        labware_check: One per frame and size that it shows of a rack or of a type of tube.
-        labware: Every rack and tube that was looked for, by name.
-        problems: One line per capture that could not be finished.
-        done: How many captures were finished or failed: all of them, but where the user stops the batch.
-    """
-
-    racks: list[Row] = field(default_factory=list)
-    sensor: list[Row] = field(default_factory=list)
-    slots: list[Row] = field(default_factory=list)
-    estimates: list[Row] = field(default_factory=list)
-    timings: list[Row] = field(default_factory=list)
-    checks: list[Row] = field(default_factory=list)
-    labware_check: list[Row] = field(default_factory=list)
-    labware: dict[str, Labware] = field(default_factory=dict)
-    problems: list[str] = field(default_factory=list)
-    done: int = 0
-
-    def lengths(self) -> tuple[int, ...]:
-        """How many rows there are, table by table."""
-        return tuple(len(rows) for rows in self._rows())
-
-    def cut(self, lengths: tuple[int, ...]) -> None:
-        """Leave out the rows that came after there were so many."""
-        for rows, length in zip(self._rows(), lengths, strict=True):
-            del rows[length:]
-
-    def _rows(self) -> tuple[list[Row], ...]:
-        return self.racks, self.sensor, self.slots, self.estimates, self.timings, self.checks, self.labware_check
 
 
 def session_jobs(session: Session, *, fail_fast: bool = False) -> tuple[list[Job], list[str]]:

@@ -11,27 +11,20 @@ from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
-from scipy.stats import norm, t
 
-from tubepose.checks import Check, reason, said, sentence
 from tubepose.config import Config, RackConfig
 from tubepose.labware import RackModel, TubeModel
 from tubepose.rack import RackPose, RackStatus
 from tubepose.rack.alternatives import line_steps_m
 from tubepose.scene import Scene, TubeEstimate
+from tubepose.statistics import weighted_mean
 from tubepose.transforms import FloatArray
-from tubepose.tube import TubeStatus
+from tubepose.tubes_pitch import MEASURED_CODES, SIGMAS, joined, ribs_stretch, tops_stretch
 
 TOLERANCE_MM = 0.5
 """A file that is off by less cannot make an answer wrong: a quarter of the 2 mm that count as wrong."""
-SIGMAS = 3.0
-"""A size contradicts its file beyond so many standard deviations: 1 of 370 by chance, for one size of one run."""
 SIZE_CODES = frozenset(("pitch_x", "pitch_y", "openings", "outline", "scale", "floor"))
 """A rack that is refused for these alone is the right one with a wrong file: its sizes are worth telling."""
-MEASURED_CODES = frozenset(("", "height_off", "tilt_uncertain", "labware"))
-"""A tube that is refused for these alone has a top that was measured and is of its type."""
-LEAST_TOPS = 6
-"""So many tops tell a pitch: fewer leave the scatter about a line of three numbers unknown."""
 LEAST_STRANGERS = 3
 """So many tops of one height that no type has are tubes, and not something that lies there."""
 MAX_OFF_MM = 5.0
@@ -111,72 +104,15 @@ def size_row(size: SizeCheck) -> dict[str, Any]:
     return {**asdict(size), "contradicts": size.contradicts}
 
 
-def refuse_by_tops(
-    scene: Scene, estimates: Sequence[TubeEstimate], config: Config
-) -> tuple[Scene, tuple[TubeEstimate, ...]]:
-    """Refuse a rack and its tubes where the measured tops lie on slots of another pitch than its file's.
-
-    `rack.proof` asks the same of ribs and of rough tops; where caps hide the ribs, the fitted circles and normals know
-    better. The limit is the same: `rack.max_pitch_mm` at the outermost slot, beyond three standard deviations.
-
-    Args:
-        scene: The frame; one whose rack has no pose, or was given one, stays as it is.
-        estimates: Answers of `profile`.
-        config: Section rack is used.
-
-    Returns:
-        The scene with two checks more (`pitch_x`, `pitch_y`), its rack refused if one of them failed; and the
-        estimates, all of them then rejected with the code `labware`.
-    """
-    pose, rack = scene.rack_pose, scene.rack
-    if pose.T_camera_rack is None or pose.resolved_by == "given":
-        return scene, tuple(estimates)
-    checks = tuple(_pitch_checks(pose, rack, estimates, config.rack))
-    wrong = [check for check in checks if not check.passed]
-    pose = replace(pose, checks=(*pose.checks, *checks))
-    if not wrong:
-        return replace(scene, rack_pose=pose), tuple(estimates)
-    why = reason(wrong, rack.name)
-    pose = replace(
-        pose, status=RackStatus.REFUSED, reason=why, T_camera_rack=None, covariance=None, ambiguous=False,
-        resolved_by="", hint_note="", bow_m=None, bow_std_m=None,
-    )  # fmt: skip
-    return replace(scene, rack_pose=pose), tuple(_as_labware(estimate, why) for estimate in estimates)
-
-
-def _as_labware(estimate: TubeEstimate, why: str) -> TubeEstimate:
-    check = said("labware", why)
-    if estimate.pose.status is not TubeStatus.OK:
-        return estimate
-    words = sentence(check, "")
-    pose = replace(estimate.pose, status=TubeStatus.REJECTED, reason=words, checks=(*estimate.pose.checks, check))
-    return replace(estimate, pose=pose)
-
-
-def _pitch_checks(
-    pose: RackPose, rack: RackModel, estimates: Sequence[TubeEstimate], config: RackConfig
-) -> Iterator[Check]:
-    reach_mm = 1e3 * np.abs(rack.slot_centers_m).max(axis=0)
-    for axis, name in enumerate("xy"):
-        tops = _tops_stretch(rack, estimates, axis)
-        if tops is None:
-            continue
-        share, std = _joined(_ribs_stretch(pose, axis), tops)
-        off_mm = float(share * reach_mm[axis])
-        passed = abs(off_mm) - SIGMAS * std * reach_mm[axis] <= config.max_pitch_mm
-        words = "farther apart" if off_mm > 0 else "nearer"
-        yield Check(f"pitch_{name}", abs(off_mm), config.max_pitch_mm, bool(passed), detail=words)
-
-
 def _rack_sizes(
     pose: RackPose, rack: RackModel, estimates: Sequence[TubeEstimate], config: RackConfig
 ) -> Iterator[SizeCheck]:
     reach_m = np.abs(rack.slot_centers_m).max(axis=0)
     for axis, (name, step_m) in enumerate(zip("xy", line_steps_m(rack), strict=True)):
-        ribs, tops = _ribs_stretch(pose, axis), _tops_stretch(rack, estimates, axis)
+        ribs, tops = ribs_stretch(pose, axis), tops_stretch(rack, estimates, axis)
         if step_m is None or (ribs is None and tops is None):
             continue
-        share, std = _joined(ribs, tops)
+        share, std = joined(ribs, tops)
         tolerance = TOLERANCE_MM * step_m / float(reach_m[axis])
         step_mm = 1e3 * step_m
         measured = step_mm * (1 + share)
@@ -212,55 +148,6 @@ def _scale(pose: RackPose, rack: RackModel, config: RackConfig) -> Iterator[Size
         tolerance = config.max_scale_shift_mm * 1e-3 / float(np.linalg.norm(face_m[:3]))
     scale = 1 + share
     yield SizeCheck("scale", rack.name, "depth_scale_m", 1.0, scale, std, 1, tolerance, 1 / scale, "outline_mm")
-
-
-def _ribs_stretch(pose: RackPose, axis: int) -> tuple[float, float] | None:
-    """By how much slots lie farther apart than defined, a share, and its std, as the rack's face says."""
-    return None if pose.size is None else (float(pose.size.stretch[axis]), float(pose.size.std[axis]))
-
-
-def _tops_stretch(rack: RackModel, estimates: Sequence[TubeEstimate], axis: int) -> tuple[float, float] | None:
-    """The same by least squares of where tubes' axes cross the face against their slots; None with too few tubes.
-
-    Neighbours whose caps touch lean outwards together, as far as their slots let them: no number of tubes takes that
-    away, so the standard deviation is never less than the scatter at the outermost slot.
-    """
-    found = [
-        (rack.slot(e.target.slot).center_m, e.pose.top.off_m)
-        for e in estimates
-        if e.target.slot is not None and e.pose.top is not None and e.pose.reason_code in MEASURED_CODES
-    ]
-    kept = [(center, off) for center, off in found if np.isfinite(off).all()]
-    if len(kept) < LEAST_TOPS:
-        return None
-    center, off = (np.array(column) for column in zip(*kept, strict=True))
-    if len(np.unique(np.rint(center[:, axis] * 1e3))) < 2:
-        return None
-    design = np.column_stack([np.ones(len(center)), center])
-    solution, _, rank, _ = np.linalg.lstsq(design, off[:, axis], rcond=None)
-    dof = len(center) - int(rank)
-    if dof < 2:
-        return None
-    scatter_m = float(np.sqrt(np.sum((off[:, axis] - design @ solution) ** 2) / dof))
-    variance = scatter_m**2 * np.linalg.pinv(design.T @ design)[1 + axis, 1 + axis]
-    leaning = scatter_m / float(np.abs(center[:, axis]).max())
-    # Few tubes: Student's tails, so that three standard deviations are as sure as of a Gaussian.
-    tails = float(t.ppf(norm.cdf(SIGMAS), dof)) / SIGMAS
-    return float(solution[1 + axis]), tails * float(np.hypot(np.sqrt(variance), leaning))
-
-
-def _joined(first: tuple[float, float] | None, second: tuple[float, float] | None) -> tuple[float, float]:
-    """Two measurements of one number by inverse variances; at least one is there."""
-    both = [one for one in (first, second) if one is not None]
-    return _weighed(np.array([one[0] for one in both]), np.array([one[1] for one in both]))
-
-
-def _weighed(values: FloatArray, stds: FloatArray) -> tuple[float, float]:
-    """Mean by inverse variances and its standard deviation, larger where the values scatter more than they state."""
-    weights = 1 / np.maximum(stds, 1e-12) ** 2
-    mean = float(weights @ values / weights.sum())
-    birge = np.sqrt(weights @ (values - mean) ** 2 / max(len(values) - 1, 1))
-    return mean, float(max(birge, 1.0) / np.sqrt(weights.sum()))
 
 
 def _tube_sizes(scene: Scene, estimates: Sequence[TubeEstimate], config: Config) -> Iterator[SizeCheck]:
@@ -345,7 +232,7 @@ def _scatter(values: FloatArray) -> float:
 
 
 def _pool(group: Sequence[SizeCheck]) -> SizeCheck:
-    measured, std = _weighed(np.array([size.measured for size in group]), np.array([size.std for size in group]))
+    measured, std = weighted_mean(np.array([size.measured for size in group]), np.array([size.std for size in group]))
     n, first = sum(size.n for size in group), group[0]
     others = "; ".join(sorted({size.other_key for size in group if size.other_key}))
     write = 1 / measured if first.quantity == "scale" else first.write + measured - first.measured

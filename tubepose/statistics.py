@@ -107,3 +107,16 @@ def coverage_curve(score: FloatArray, error: FloatArray) -> CoverageCurve:
         mean_error=np.cumsum(errors)[last] / (last + 1),
         max_error=np.maximum.accumulate(errors)[last],
     )
+
+
+def weighted_mean(values: FloatArray, stds: FloatArray) -> tuple[float, float]:
+    """Mean by inverse variances and its standard deviation, larger where values scatter more than they state (Birge).
+
+    Args:
+        values: Array of shape (N,), N at least one.
+        stds: Their standard deviations, shape (N,).
+    """
+    weights = 1 / np.maximum(stds, 1e-12) ** 2
+    mean = float(weights @ values / weights.sum())
+    birge = np.sqrt(weights @ (values - mean) ** 2 / max(len(values) - 1, 1))
+    return mean, float(max(birge, 1.0) / np.sqrt(weights.sum()))
