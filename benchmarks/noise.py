@@ -19,7 +19,8 @@ from tubepose.batch import trial_capture
 from tubepose.capture.session import Session, Trial, load_session
 from tubepose.config import Config
 from tubepose.labware import TubeModel
-from tubepose.profile.measure import Measured, measure_tops
+from tubepose.profile.closed_tops import Measured
+from tubepose.profile.measure import measure_tops
 from tubepose.simulation import read_exact_truth
 from tubepose.transforms import FloatArray, invert_transform
 

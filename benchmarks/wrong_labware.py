@@ -34,6 +34,7 @@ from benchmarks.wrong_labware_scenes import SETS, View, view
 from tubepose.config import Config
 from tubepose.detection.geometric import GeometricDetector
 from tubepose.errors import TubePoseError
+from tubepose.labware_check import refuse_by_tops
 from tubepose.pipeline import DEFAULT_METHOD, Scene, estimate_tubes, prepare_scene
 from tubepose.provenance import pinned_threads
 from tubepose.records import estimate_row, rack_row, slot_rows
@@ -68,6 +69,7 @@ def ask(case: Case, config: Config) -> tuple[Answer, Row]:
     try:
         scene = prepare_scene(case.frame, case.rack, case.tubes, detector, config, methods=(DEFAULT_METHOD,))
         estimates, _ = estimate_tubes(scene, DEFAULT_METHOD, config)
+        scene, estimates = refuse_by_tops(scene, estimates, config)
     except TubePoseError as refusal:
         return Answer(case.rack, None, False, str(refusal)), {"resolved_by": "error"}
     rack = rack_row(scene)
@@ -85,6 +87,7 @@ def ask(case: Case, config: Config) -> tuple[Answer, Row]:
         reason,
         tuple(tubes),
         {row["slot"]: stated(row) for row in slots},
+        frozenset(filter(None, str(rack["marks"]).split(";"))),
     )
     return answer, {"resolved_by": rack["resolved_by"], "tubes_not_ok": _not_ok(scene, estimates)}
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -73,6 +73,7 @@ class Answer:
         reason: Why there is no rack; its reason code where there is one.
         tubes: Tubes with status `ok`.
         slots: State of every slot: `empty`, `occupied`, or words that state neither.
+        marks: Codes of the checks that mark an accepted rack.
     """
 
     rack: RackModel
@@ -81,6 +82,7 @@ class Answer:
     reason: str
     tubes: tuple[StatedTube, ...] = ()
     slots: Mapping[str, str] | None = None
+    marks: frozenset[str] = frozenset()
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,6 +93,7 @@ class Verdict:
         racks: Racks accepted, 0 or 1.
         ambiguous: Accepted ones that are marked ambiguous.
         needless: Of these, ones whose true rack looks the same under no turn.
+        marked: Accepted ones that are off at their face and say so: their scale is marked.
         tubes: Tubes stated.
         kept: True tubes that a stated one without any fault belongs to.
         not_stated: Slots of the accepted rack that are called neither empty nor occupied.
@@ -109,6 +112,7 @@ class Verdict:
     racks: int = 0
     ambiguous: int = 0
     needless: int = 0
+    marked: int = 0
     tubes: int = 0
     kept: int = 0
     not_stated: int = 0
@@ -152,12 +156,17 @@ def judge(truth: Truth, answer: Answer, same_rack: bool, face_truth: Truth | Non
     verdicts = []
     for turn in turns:
         off = not same_rack or face_is_off(_turned(face_truth or truth, turn), answer)
-        verdicts.append(_judged(_turned(truth, turn), answer, off))
+        verdict = _judged(_turned(truth, turn), answer, off)
+        if off and same_rack and SCALE in answer.marks:
+            verdict = replace(verdict, wrong_racks=0, marked=1)
+        verdicts.append(verdict)
     best = min(verdicts, key=lambda verdict: (verdict.wrong, -verdict.kept))
     needless = int(answer.ambiguous and same_rack and len(turns) == 1)
     return best + Verdict(racks=1, ambiguous=int(answer.ambiguous), needless=needless)
 
 
+SCALE = "scale"
+"""The mark that says that an accepted rack is off along the line of sight."""
 _NO_TURN: FloatArray = np.eye(4)
 
 

@@ -10,7 +10,13 @@ from hypothesis import strategies as st
 
 from tubepose.capture import CameraIntrinsics, estimate_intrinsics, project_cloud
 from tubepose.capture.frame import RgbdFrame
-from tubepose.capture.registration import clean_cloud, is_mirrored, refuse_mirrored
+from tubepose.capture.registration import (
+    clean_cloud,
+    foreign_center_m,
+    is_mirrored,
+    refuse_foreign_frame,
+    refuse_mirrored,
+)
 from tubepose.errors import CaptureError
 from tubepose.transforms import axis_rotation, make_transform, transform_points
 
@@ -104,3 +110,54 @@ def test_clean_cloud_scales_a_copy(scale):
     np.testing.assert_array_equal(xyz, kept)
     np.testing.assert_allclose(cleaned[[0, 3]], kept[[0, 3]] * scale)
     assert np.isnan(cleaned[1:3]).all()
+
+
+VIEW = CameraIntrinsics(200, 160, 300.0, 310.0, 101.0, 83.0)
+
+
+def relief(seed=2):
+    """A cloud with relief of 0.2 m, every fifth pixel missing."""
+    depth = np.random.default_rng(seed).uniform(0.6, 0.8, (160, 200))
+    depth[::5] = np.nan
+    return VIEW.backproject(depth)
+
+
+def moved(cloud, T):
+    return transform_points(T, cloud.reshape(-1, 3)).reshape(cloud.shape)
+
+
+@pytest.mark.parametrize("center_m", [(0.4, -0.2, 0.7), (0.08, 0.0, 0.0), (0.0, 0.0, -0.3)])
+def test_where_the_lines_of_sight_of_a_moved_cloud_meet(center_m):
+    T = make_transform(axis_rotation(np.array([0.3, -2.0, 0.4])), np.array(center_m))
+    np.testing.assert_allclose(foreign_center_m(moved(relief(), T)), center_m, atol=1e-3)
+
+
+def test_a_cloud_in_a_robots_frame_is_refused():
+    frame = RgbdFrame(relief(), None, None, None, "scan", index=3)
+    refuse_foreign_frame(frame)
+    T = make_transform(axis_rotation(np.array([0.0, 1.0, 0.0])), np.array([0.5, 0.25, 0.75]))
+    robot = replace(frame, cloud_m=moved(frame.cloud_m, T))
+    with pytest.raises(
+        CaptureError, match=r"^frame 3: the cloud is not in .* meet at \(0\.50, 0\.25, 0\.75\) m; expected"
+    ):
+        refuse_foreign_frame(robot)
+    refuse_foreign_frame(replace(robot, cloud_m=robot.cloud_m.reshape(1, -1, 3), organised=False))
+
+
+def test_clouds_that_do_not_tell_where_their_camera_is_are_not_refused():
+    turned = moved(relief(), make_transform(axis_rotation(np.array([0.0, 1.0, 0.0])), np.zeros(3)))
+    assert foreign_center_m(turned) is None  # the camera is at the origin, whatever the axes
+    plane = VIEW.backproject(np.full((160, 200), 0.7))
+    assert foreign_center_m(moved(plane, make_transform(np.eye(3), np.array([0.3, 0.0, 0.2])))) is None
+    shuffled = np.random.default_rng(3).permutation(relief().reshape(-1, 3)).reshape(160, 200, 3)
+    assert foreign_center_m(shuffled) is None
+    assert foreign_center_m(np.full((160, 200, 3), np.nan)) is None
+
+
+def test_a_distorted_lens_is_no_foreign_frame():
+    rays = VIEW.rays()
+    radius = np.hypot(rays[..., 0], rays[..., 1])[..., None]
+    bent = np.concatenate([rays[..., :2] * (1 - 0.5 * radius**2), rays[..., 2:]], axis=-1)
+    cloud = bent * np.random.default_rng(5).uniform(0.6, 0.8, (160, 200, 1))
+    assert estimate_intrinsics(cloud) is None
+    assert foreign_center_m(cloud) is None

@@ -7,8 +7,9 @@ from test_profile_rims import CAMERA, INNER_M, LEVEL_M, OUTER_M, RACK, VIEW, dra
 from tubepose.config import Config, ProfileConfig
 from tubepose.labware import load_tube
 from tubepose.profile import fit_profiles
-from tubepose.profile.faint_rims import RimSearch, find_faint_rims
-from tubepose.profile.measure import blocked_sectors, measure_tops
+from tubepose.profile.closed_tops import blocked_sectors
+from tubepose.profile.faint_rims import RimSearch, find_faint_rims, without_bare
+from tubepose.profile.measure import measure_tops
 from tubepose.profile.outline import SECTORS
 from tubepose.profile.standing import Standing
 from tubepose.profile.tops import mouth_radius_m, top_radius_m
@@ -225,3 +226,21 @@ def test_a_torn_ring_that_is_no_ring_of_one_gray_is_less_sure():
     off_m, std_m = with_points_on_a_rim(lambda angle: np.where(np.abs(angle) < 1.8, 160.0, 60.0))
     assert np.abs(off_m).max() < CONFIG.lone_rim_m
     assert std_m.min() > CONFIG.lone_rim_m
+
+
+@pytest.mark.parametrize(("spacing_m", "is_told"), [(0.5e-3, False), (12e-3, True)])
+def test_a_ring_without_a_point_is_none_where_others_of_its_type_return_many(spacing_m, is_told):
+    known_m = CENTERS_M[[0, 2]]
+    angle = np.arange(0, 2 * np.pi, spacing_m / OUTER_M)
+    rim = np.column_stack([np.cos(angle), np.sin(angle)]) * (INNER_M + OUTER_M) / 2
+    points = [np.column_stack([rim + middle, np.full(len(rim), LEVEL_M)]) for middle in known_m]
+    standing = Standing(np.vstack(points), NOTHING.camera_m)
+    search = RimSearch(
+        seen(drawn(VIEW, CENTERS_M[1])), CENTERS_M[1:2], REACH_M, LEVEL_M, np.array([INNER_M, OUTER_M]), free, standing,
+        NO_HOLES, CONFIG,
+    )  # fmt: skip
+    found = find_faint_rims(search)
+    assert np.isfinite(found.evenness[0])
+    assert np.isfinite(without_bare(found, known_m, search).evenness[0]) == is_told
+    # One rim with points says nothing of all of them.
+    assert np.isfinite(without_bare(found, known_m[:1], search).evenness[0])

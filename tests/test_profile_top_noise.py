@@ -10,7 +10,7 @@ import scenes
 from tubepose.config import Config
 from tubepose.labware import load_rack, load_tube
 from tubepose.profile.estimate import fit_frame
-from tubepose.profile.top_noise import height_limit_m, noisy_config, wall_noise
+from tubepose.profile.top_noise import depths_m, height_limit_m, noisy_config, wall_noise
 from tubepose.sensor import measure_noise, prior_noise
 from tubepose.sensor.noise import PRIOR
 from tubepose.simulation.depth_noise import DepthNoise
@@ -119,3 +119,11 @@ def test_noise_along_the_line_of_sight_moves_walls_that_are_seen_from_the_side()
     scale = np.hypot(0.6, 0.6) / noise.distance_m
     assert slanted.shared_m == pytest.approx(2e-4 * np.sqrt(0.5) * scale)
     assert slanted.independent_m == pytest.approx(1e-4 * np.sqrt(0.5) * scale)
+
+
+def test_depth_is_along_the_optical_axis_and_the_distance_in_a_turned_cloud():
+    place = np.array([[0.05, 0.1, 0.2]])
+    there = VIEW[:3, :3] @ place[0] + VIEW[:3, 3]
+    assert depths_m(VIEW, place) == pytest.approx([there[2]])
+    turned = np.array([[0.0, 0, 1, 0], [0, 1, 0, 0], [-1, 0, 0, 0], [0, 0, 0, 1]]) @ VIEW
+    assert depths_m(turned, place) == pytest.approx([np.linalg.norm(there)])

@@ -5,7 +5,7 @@ import pytest
 
 from tubepose.config import ProfileConfig
 from tubepose.labware import load_rack, load_tube
-from tubepose.profile.measure import NEAR_TOP_M, label_points
+from tubepose.profile.closed_tops import NEAR_TOP_M, label_points
 from tubepose.profile.standing import Standing
 from tubepose.profile.tops import (
     _scores_in,

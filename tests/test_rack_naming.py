@@ -40,7 +40,7 @@ def test_a_rack_is_named_out_of_the_catalogue(name):
     pose, ranking = name_rack(points, CONFIG)
     assert pose.status is RackStatus.OK, pose.reason
     assert pose.rack == ranking[0].rack == rack
-    assert 60 < pose.named_by_nats
+    assert pose.named_by_nats > 60
     angles = [scenes.angle_deg(pose.T_camera_rack[:3, :3], (T @ turn)[:3, :3]) for turn in (np.eye(4), HALF_TURN)]
     assert min(angles) < 0.1
 

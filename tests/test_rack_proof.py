@@ -171,7 +171,7 @@ def test_cells_say_solid_open_standing_or_nothing():
     square = np.stack(np.meshgrid(np.linspace(-8e-3, 8e-3, 60), np.linspace(-8e-3, 8e-3, 60)), axis=-1).reshape(-1, 2)
 
     def at(x_m: float, y_m: float, over_m: float) -> np.ndarray:
-        return np.column_stack([square + (x_m, y_m), np.full(len(square), SOFT.height_m + over_m)])
+        return np.column_stack([square + np.array([x_m, y_m]), np.full(len(square), SOFT.height_m + over_m)])
 
     points = np.vstack([at(-0.05, 0.0, 0.0), at(0.05, 0.0, -5e-3), at(0.0, 0.03, 30e-3), at(0.0, -0.03, 0.0)])
     face = look_at_face(transform_points(T, points), T, SOFT, 0.4e-3, grid, SPACING_M)

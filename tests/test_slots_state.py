@@ -12,8 +12,10 @@ from tubepose.slots.state import ACCEPTED, PRIOR_DOUBTFUL
 NOTHING = SlotLook("A1", *[0.0] * 11)
 
 
-def seen(passed=0.0, stopped=0.0):
-    return dataclasses.replace(NOTHING, patches_passed=passed, patches_stopped=stopped, seen_share=0.4)
+def seen(passed=0.0, stopped=0.0, covered=0.6):
+    return dataclasses.replace(
+        NOTHING, patches_passed=passed, patches_stopped=stopped, seen_share=0.4, covered=covered if stopped else 0.0
+    )
 
 
 @pytest.mark.parametrize(
@@ -24,6 +26,7 @@ def seen(passed=0.0, stopped=0.0):
         (seen(passed=0.9), SlotState.NOT_SEEN),
         (seen(passed=3.0), SlotState.EMPTY),
         (seen(stopped=3.0), SlotState.OCCUPIED),
+        (seen(stopped=3.0, covered=0.2), SlotState.UNCLEAR),  # the edge of a neighbour's cap
         (seen(passed=3.0, stopped=3.0), SlotState.UNCLEAR),
         (seen(passed=5.0, stopped=2.0), SlotState.UNCLEAR),
         (seen(passed=9.0, stopped=1.0), SlotState.EMPTY),

@@ -101,6 +101,18 @@ SENTENCES = {
         "it stands {value:.1f} deg off the level of the scene, at most {limit:g} deg expected, and little of its "
         "top is seen"
     ),
+    "faces_away": (
+        "the origin sees the face of {name} at {value:.0f} deg off its normal, at most {limit:g} deg expected: the "
+        "origin has to be the camera; is the cloud in a robot's frame?"
+    ),
+    "seen_through": (
+        "lines from the origin to points behind the face of {name} cross its solid part {value:.0f}% as often as "
+        "without a face, at most {limit:g}% expected: the origin has to be the camera; is the cloud in a robot's frame?"
+    ),
+    "table_above": (
+        "{value:.0f}% of what lies around {name} is as far above its face as its table is below it, at most {limit:g}% "
+        "expected: the face is seen from behind; the origin has to be the camera; is the cloud in a robot's frame?"
+    ),
     "grid": "{detail}",
     "two_places": (
         "two places look like {name} (the better one by a ratio of {value:.2f} in evidence, {limit:g} expected): "

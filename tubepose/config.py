@@ -119,8 +119,8 @@ class RackConfig(_Section):
         max_scale: Largest difference of scale, as a share, of everything that is seen of the rack.
         max_scale_shift_mm: A difference of scale that moves the rack by more along the line of sight is marked.
         edge_std_mm: How far a sensor's blur and a projector's shadow move the edge of an outline.
-        max_tops_off: How far the tops of what stands in the slots may lie from the slots' centres, median, as a share of
-            the distance of slots: tubes lean by a tenth, and tops anywhere give 0.4.
+        max_tops_off: How far the tops of what stands in the slots may lie from the slots' centres, median, as a share
+            of the distance of slots: tubes lean by a tenth, and tops anywhere give 0.4.
         max_bow_mm: Largest bow of a face, at the ends of its outline (two of two real racks: 0.7 to 2 mm).
         max_floor_mm: How far the slots' floor may be seen from where the file has it, beside three standard deviations.
         min_seen: Smallest share of the template that is seen: a rack full of caps shows 5 to 24 %.
@@ -286,6 +286,9 @@ class ProfileConfig(_Section):
         wall_redundancy: How many neighbouring points of a wall count as one: they share their error.
         min_wall_points: Fewer points near a wall's radius say nothing.
         cap_height_m: Standard deviation of the height at which a cap sits, with the scanner's own error.
+        cap_radius_m: Standard deviation of a cap's radius about its definition: moulded caps hold 0.1 mm.
+        type_height_m: Standard deviation of what a type's height is off in a file that is not right: by a ruler.
+        min_type_odds: Least log odds (nats) of a top's type against every other given one and another type: 99 to 1.
         cap_tilt_rad: Standard deviation of how crooked a cap sits, about each of two axes.
         slope_std: Width of the proposal in the slope of the axis; wider than any slot allows.
         slot_tolerance_m: How soft the walls of the slot and the edge of its floor's play are.
@@ -318,6 +321,9 @@ class ProfileConfig(_Section):
     lone_rim_m: float = 8.0e-4
     torn_rim_m: float = 6.0e-4
     cap_height_m: float = Field(default=3.0e-4, gt=0)
+    cap_radius_m: float = Field(default=1.0e-4, gt=0)
+    type_height_m: float = Field(default=1.0e-3, gt=0)
+    min_type_odds: float = 4.6
     cap_tilt_rad: float = 0.0030
     wall_noise_m: float = Field(default=1.5e-4, gt=0)
     wall_radius_m: float = Field(default=1.0e-4, gt=0)

@@ -10,7 +10,7 @@ from typing import TypeGuard
 from tubepose.baselines import fit_global_icp, fit_slot_icp, fit_upright
 from tubepose.capture.frame import CameraIntrinsics, RgbdFrame
 from tubepose.capture.hints import TurnHint
-from tubepose.capture.registration import known_intrinsics, refuse_mirrored
+from tubepose.capture.registration import known_intrinsics, refuse_foreign_frame, refuse_mirrored
 from tubepose.checks import failed
 from tubepose.config import Config
 from tubepose.detection import Detection, Detector, points_in_box
@@ -68,11 +68,12 @@ def prepare_scene(
         methods: Methods that will be asked; slots of detected tubes are left out where none needs them.
 
     Raises:
-        CaptureError: The cloud is mirrored.
+        CaptureError: The cloud is mirrored, or not in the camera's frame.
         DetectorError: The detector cannot work on this frame.
     """
     clock = Clock()
     refuse_mirrored(frame)
+    refuse_foreign_frame(frame)
     intrinsics = known_intrinsics(frame)
 
     def registered(boxes: Sequence[Detection]) -> RackPose:

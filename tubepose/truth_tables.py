@@ -11,7 +11,7 @@ import numpy as np
 import pandas as pd
 
 from tubepose.batch import Job, trial_capture
-from tubepose.capture.registration import refuse_mirrored
+from tubepose.capture.registration import refuse_foreign_frame, refuse_mirrored
 from tubepose.capture.session import Session, Trial
 from tubepose.errors import CaptureError, ConfigError, TubePoseError, kept
 from tubepose.ground_truth import GroundTruthConfig, GroundTruthResult, measure_ground_truth
@@ -82,6 +82,7 @@ def _measure_trial(session: Session, trial: Trial, tables: TruthTables, config: 
     if frame is None:
         raise CaptureError(f"{session.folder / trial.printed}: no frame in it")
     refuse_mirrored(frame)
+    refuse_foreign_frame(frame)
     tubes = {slot: session.tubes[name] for slot, name in trial.tubes.items()}
     result = measure_ground_truth(frame, session.rack, tubes, session.printed_cap, trial.hint, config)
     keys = {"session": session.name, "trial": trial.name}

@@ -22,6 +22,12 @@ _MIN_POINTS = 100
 
 MIRROR_PIXELS = 4000
 """So many pixels, evenly spread, tell a mirrored cloud."""
+_MOVED_SHARE = 0.5
+"""A centre elsewhere has to leave this share, or less, of what lines of sight from the origin leave: a lens's
+distortion, which no centre explains, is not taken for a cloud that was moved."""
+_LENS_SHARE = 0.01
+"""RMS residual of a pinhole fit to a camera with a usual lens's distortion, as a share of the image's longer side;
+clouds whose pixels are in no order leave a quarter."""
 FARTHEST_M = 1e4
 """No sensor of racks sees as far: numbers like this mark a missing point."""
 
@@ -126,6 +132,77 @@ def refuse_mirrored(frame: RgbdFrame) -> None:
             f"frame {frame.index}: the cloud is mirrored against its pixels; expected x to the right of the image, "
             "y down and z forward: turn the sign of one axis when you export it"
         )
+
+
+def refuse_foreign_frame(frame: RgbdFrame) -> None:
+    """Say so where a frame's organised cloud is not in its camera's frame but in another one, a robot's say.
+
+    Raises:
+        CaptureError: The lines of sight of its pixels meet in a point that is not the origin.
+    """
+    center_m = foreign_center_m(frame.cloud_m) if frame.organised else None
+    if center_m is not None:
+        x, y, z = (f"{value:.2f}" for value in center_m)
+        raise CaptureError(
+            f"frame {frame.index}: the cloud is not in the camera's frame: the lines of sight of its pixels meet at "
+            f"({x}, {y}, {z}) m; expected at the origin, with x to the right of the image, y down and z forward: "
+            "export it in the camera's coordinate space, without a transformation to a robot or a marker"
+        )
+
+
+def foreign_center_m(cloud_m: FloatArray) -> FloatArray | None:
+    """Where the lines of sight of an organised cloud meet, if that is not the origin: direct linear transformation.
+
+    A pinhole camera at the origin maps points to pixels by a matrix (3, 3), wherever its axes point; one elsewhere by
+    a matrix (3, 4), whose null space is its centre (Hartley and Zisserman, sections 6.2 and 7.1). Some pixels are
+    looked at. Points of one plane fit both, so that nothing is told by them.
+
+    Args:
+        cloud_m: Array of shape (H, W, 3), metres, NaN for invalid pixels.
+
+    Returns:
+        The centre, shape (3,), metres; None where the lines meet at the origin within a residual (RMS) of 1 px, where
+        no camera explains the cloud clearly better, and with fewer than 100 points.
+    """
+    step = max(1, int(np.sqrt(cloud_m.shape[0] * cloud_m.shape[1] / MIRROR_PIXELS)))
+    some = cloud_m[::step, ::step]
+    v, u = np.nonzero(np.isfinite(some).all(axis=-1))
+    if len(u) < _MIN_POINTS:
+        return None
+    points: FloatArray = some[v, u]
+    pixels = np.asarray(np.column_stack([u, v]) * float(step), float)
+    _, here_px = _fit_projection(points, pixels)
+    if here_px <= _MAX_RESIDUAL_PX:
+        return None
+    middle = points.mean(axis=0)
+    scale = float(np.abs(points - middle).max())
+    matrix, anywhere_px = _fit_projection(np.column_stack([(points - middle) / scale, np.ones(len(points))]), pixels)
+    lens_px = _LENS_SHARE * max(cloud_m.shape[:2])
+    if anywhere_px > max(_MAX_RESIDUAL_PX, min(lens_px, _MOVED_SHARE * here_px)):
+        return None
+    center = np.linalg.svd(matrix)[2][-1]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        center_m = middle + scale * center[:3] / center[3]
+    return np.asarray(center_m) if np.isfinite(center_m).all() else None
+
+
+def _fit_projection(points: FloatArray, pixels: FloatArray) -> tuple[FloatArray, float]:
+    """Matrix (3, K) that maps points (N, K) to pixels (N, 2) with least algebraic error; its RMS residual, pixels."""
+    size = float(np.abs(pixels).max()) or 1.0
+    scaled = pixels / size - 0.5
+    zero = np.zeros_like(points)
+    rows = np.vstack(
+        [
+            np.hstack([points, zero, -scaled[:, :1] * points]),
+            np.hstack([zero, points, -scaled[:, 1:] * points]),
+        ]
+    )
+    matrix = np.linalg.eigh(rows.T @ rows)[1][:, 0].reshape(3, -1)
+    seen = points @ matrix.T
+    with np.errstate(divide="ignore", invalid="ignore"):
+        off = size * (seen[:, :2] / seen[:, 2:] - scaled)
+        rms = float(np.sqrt(2 * np.mean(off**2)))
+    return matrix, rms if np.isfinite(rms) else float("inf")
 
 
 def _fit_lines(cloud_m: FloatArray) -> tuple[tuple[float, float], tuple[float, float]] | None:

@@ -15,11 +15,12 @@ from tubepose.config import Config, ProfileConfig
 from tubepose.labware import RackModel, TubeModel
 from tubepose.preprocessing import TALLEST_TUBE_M
 from tubepose.profile.bowed import FaceBow, SlotFrame, in_rack_frame, slot_frame
+from tubepose.profile.closed_tops import Measured
 from tubepose.profile.floor import SETTLED_MM, settle_floor
 from tubepose.profile.fusing import fuse, pose_covariance, rise_m
 from tubepose.profile.kernels import grouped
 from tubepose.profile.leftovers import Leftover, find_leftovers
-from tubepose.profile.measure import Measured, measure_tops
+from tubepose.profile.measure import measure_tops
 from tubepose.profile.plane import top_spacing_m
 from tubepose.profile.posterior import Posterior, per_model
 from tubepose.profile.standing import Standing, gather_standing
@@ -182,8 +183,9 @@ def _of_rack(tube: ProfileTube, local: SlotFrame) -> ProfileTube:
 
 def _fit_part(part: _Part, tubes: Sequence[TubeModel], noise: SensorNoise, config: ProfileConfig) -> list[ProfileTube]:
     """Poses of all tubes in a rack with a flat face, in the frame of the rack that it is a part of."""
-    rack, models = part.rack, part.models(tubes)
-    leftovers = find_leftovers(part.measured.points, part.measured.label, part.measured.tops.slot.tolist(), rack, tubes)
+    rack, models, strangers = part.rack, part.models(tubes), part.measured.strangers
+    taken = [*part.measured.tops.slot.tolist(), *(left.slot for left in strangers if left.slot is not None)]
+    leftovers = find_leftovers(part.measured.points, part.measured.label, taken, rack, tubes)
     measured, top_noise = believed(part.measured, models, part.T_camera_rack, rack, noise, config, part.covariance)
     posterior = fuse(measured, models, rack, config, wall_noise(measured.points.camera_m, rack, noise))
     covariance = pose_covariance(posterior, measured, models, rack, config, part.covariance, top_noise)
@@ -197,7 +199,7 @@ def _fit_part(part: _Part, tubes: Sequence[TubeModel], noise: SensorNoise, confi
         if crowd and pose.status is TubeStatus.OK:
             pose = _rejected(pose, said("two_in_slot", crowd))
         found.append(ProfileTube(slot.name, tube, float(measured.tops.support[i]), clouds[i], pose))
-    found += [_no_tube(left, measured.points, rack) for left in leftovers]
+    found += [_no_tube(left, measured.points, rack) for left in (*strangers, *leftovers)]
     if part.local is None:
         return found
     return [_of_rack(tube, part.local) for tube in found if _is_of(tube, rack)]

@@ -12,7 +12,7 @@ middle is where it is most even.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -57,6 +57,10 @@ HOLE_M = 1.5e-3
 BIN_M = 1e-3
 ONE_HEIGHT_SHARE, ALL_AROUND = 0.6, 0.6
 """Points on a ring are at one height where three bins hold this share of them, in this share of its sectors."""
+
+LEAST_MATES, MATES_POINTS, BARE_SHARE = 2, 30.0, 0.1
+"""So many rims of a type tell how many points one returns, if that is enough to be sure; with less than this share of
+it a ring is none: a Poisson law of 30 points gives 3 or fewer once in 10^9."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -137,6 +141,34 @@ def find_faint_rims(search: RimSearch) -> FaintRims:
     seen &= ((~blocked).mean(axis=1) >= LEAST_FREE) & ~_at_another_height(place, search) & ~is_a_hole(place, search)
     told[at] = np.where(seen, rings.evenness[at], -np.inf)
     return FaintRims(rings.center_m, circles.put(at, measured), told)
+
+
+def without_bare(found: FaintRims, known_m: FloatArray, search: RimSearch) -> FaintRims:
+    """The same without rims that hardly return a point where others of their type return many: all are of one plastic.
+
+    Args:
+        found: Rims that the image shows.
+        known_m: Middles of rims of that type that the cloud shows, rack frame, shape (N, 2), metres.
+        search: Where they were looked for.
+    """
+    if len(known_m) < LEAST_MATES or not np.isfinite(found.evenness).any():
+        return found
+    usual = float(np.median(_returned(known_m, search)))
+    if usual < MATES_POINTS:
+        return found
+    place_m = found.center_m + np.nan_to_num(found.circles.offset_m)
+    bare = _returned(place_m, search) < BARE_SHARE * usual
+    return replace(found, evenness=np.where(bare, -np.inf, found.evenness))
+
+
+def _returned(center_m: FloatArray, search: RimSearch) -> FloatArray:
+    """How many points lie on rims about some middles (N, 2), as a type's rims return them, shape (N,)."""
+    inner, outer = search.radii_m
+    z = search.standing.points_m[:, 2] - search.level_m
+    near = (z > -search.config.rim_depth_m) & (z < search.config.top_band_m)
+    flat_m = search.standing.take(near).on_level(search.level_m)
+    apart = [np.hypot(*(flat_m - middle).T) for middle in center_m]
+    return np.array([np.count_nonzero((r > inner - BESIDE_M) & (r < outer + BESIDE_M)) for r in apart], float)
 
 
 def _measured(center_m: FloatArray, blocked: NDArray[np.bool_], search: RimSearch) -> tuple[Circles, NDArray[np.bool_]]:

@@ -8,7 +8,7 @@ import numpy as np
 
 from tubepose.config import ProfileConfig
 from tubepose.labware import RackModel, TubeModel
-from tubepose.profile.measure import Measured
+from tubepose.profile.closed_tops import Measured
 from tubepose.profile.posterior import FEW_SAMPLES, Evidence, Posterior, combine, evidence, per_model
 from tubepose.profile.top_noise import TopNoise
 from tubepose.profile.wall import WallNoise, wall_evidence

@@ -24,6 +24,9 @@ SAME_HEIGHT_M = 1.0e-3
 LYING_PITCHES = 1.6
 """Something longer than this many pitches stands in no slot."""
 
+NO_TOP, STRANGE_TOP = -1, -2
+"""Labels of points that are of no top, and of one that is of no given type."""
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Leftover:
@@ -51,12 +54,12 @@ def find_leftovers(
 
     Args:
         standing: Points above the rack's top.
-        label: Tube of each point, -1 for none.
-        taken: Slots that hold a tube.
+        label: Tube of each point, `NO_TOP` for none.
+        taken: Slots that hold a tube, or a top of no given type.
         rack: The rack.
         tubes: The types that were looked for.
     """
-    rest = np.flatnonzero(label < 0)
+    rest = np.flatnonzero(label == NO_TOP)
     if len(rest) == 0:
         return ()
     half = rack.outline_m / 2 + OUTSIDE_M

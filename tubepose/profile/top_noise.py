@@ -9,8 +9,8 @@ import numpy as np
 
 from tubepose.config import Config, ProfileConfig
 from tubepose.labware import RackModel, TubeModel
+from tubepose.profile.closed_tops import ON_PLANE_SHARE, Measured
 from tubepose.profile.kernels import grouped
-from tubepose.profile.measure import ON_PLANE_SHARE, Measured
 from tubepose.profile.plane import EDGE_M
 from tubepose.profile.posterior import per_model
 from tubepose.profile.tops import top_radius_m
@@ -52,7 +52,7 @@ def noisy_config(config: Config, noise: SensorNoise, T_camera_rack: FloatArray, 
         T_camera_rack: The rack's pose, shape (4, 4), metres.
         rack: The rack.
     """
-    depth_m = float(T_camera_rack[2] @ [0.0, 0.0, rack.height_m, 1.0])
+    depth_m = float(depths_m(T_camera_rack, np.array([[0.0, 0.0, rack.height_m]]))[0])
     scale = depth_m / noise.distance_m
     point_m = float(np.hypot(noise.independent_m, noise.shared_m)) * scale
     profile, prior = config.profile, config.sensor
@@ -99,7 +99,7 @@ def believed(
         return measured, TopNoise(np.zeros(0), np.zeros((0, 2)))
     planes, camera_m = measured.planes, measured.points.camera_m
     place = np.column_stack([measured.tops.center_m, measured.level_m])
-    depth = place @ T_camera_rack[2, :3] + T_camera_rack[2, 3]
+    depth = depths_m(T_camera_rack, place)
     radii = np.maximum(per_model(models, top_radius_m) - EDGE_M, SMALLEST_DISC_M)
     slope_std, height_std = np.array(
         [(noise.slope_std(r, d), noise.height_std_m(r, d)) for r, d in zip(radii.tolist(), depth.tolist(), strict=True)]
@@ -130,6 +130,16 @@ def believed(
         center_m=measured.center_m + lower[:, None] * sight,
     )
     return changed, TopNoise(height_var + rack_var, sight)
+
+
+def depths_m(T_camera_rack: FloatArray, places_m: FloatArray) -> FloatArray:
+    """Depth of places (N, 3) of the rack's frame along the optical axis, shape (N,), metres.
+
+    In a cloud that was turned no axis is the optical one: what lies farther than 60 deg off it has its distance.
+    """
+    seen = places_m @ T_camera_rack[:3, :3].T + T_camera_rack[:3, 3]
+    distance = np.linalg.norm(seen, axis=1)
+    return np.asarray(np.where(seen[:, 2] > distance / 2, seen[:, 2], distance))
 
 
 def height_limit_m(height_var_m2: FloatArray, config: ProfileConfig) -> FloatArray:
@@ -180,6 +190,7 @@ def cap_discs(measured: Measured, models: Sequence[TubeModel], T_camera_rack: Fl
     """
     planes = measured.planes
     points_m, ends = grouped(measured.points.points_m, measured.label, len(models))
+    depth_m = depths_m(T_camera_rack, np.column_stack([measured.tops.center_m, measured.level_m]))
     found = {}
     for i in np.flatnonzero(np.isfinite(planes.height_m)).tolist():
         radius_m = top_radius_m(models[i]) - EDGE_M
@@ -188,6 +199,5 @@ def cap_discs(measured: Measured, models: Sequence[TubeModel], T_camera_rack: Fl
         off_m = own[:, 2] - planes.height_m[i] - xy_m @ planes.slope[i]
         # What lies farther off than that is of something else.
         on_top = (np.hypot(*xy_m.T) < radius_m) & (np.abs(off_m) < OFF_STDS * planes.rms_m[i])
-        depth_m = float(T_camera_rack[2] @ [*measured.tops.center_m[i], planes.height_m[i], 1.0])
-        found[i] = CapDisc(xy_m[on_top], off_m[on_top], radius_m, depth_m)
+        found[i] = CapDisc(xy_m[on_top], off_m[on_top], radius_m, float(depth_m[i]))
     return found

@@ -11,6 +11,7 @@ from dataclasses import replace
 
 from tubepose.capture.frame import CameraIntrinsics
 from tubepose.capture.hints import TurnHint
+from tubepose.checks import reason
 from tubepose.config import Config
 from tubepose.labware import RackModel
 from tubepose.preprocessing import level_noise_m, plausible_unit_factors, thin
@@ -18,6 +19,7 @@ from tubepose.rack.edges import register_edges
 from tubepose.rack.insufficient import outline_words, too_noisy
 from tubepose.rack.obb import register_obb_icp
 from tubepose.rack.pose import MIN_POINTS, RackPose, RackStatus
+from tubepose.rack.viewpoint import viewpoint_checks
 from tubepose.transforms import FloatArray
 
 _Method = Callable[
@@ -49,7 +51,9 @@ def register_rack(
     """
     method = _METHODS[config.rack.method]
     pose = method(points_m, rack, config, hint, intrinsics)
-    if pose.status is RackStatus.OK or len(points_m) < MIN_POINTS:
+    if pose.status is RackStatus.OK:
+        return _seen_from_origin(pose, points_m, rack)
+    if len(points_m) < MIN_POINTS:
         return pose
     # Asked of a too coarse scan as well: millimetres read as metres are one.
     reason = _unit_suspicion(points_m, rack, config, method)
@@ -61,6 +65,16 @@ def register_rack(
             words = too_noisy(noise_m, pose.reason, config.rack)
             return replace(pose, status=RackStatus.INSUFFICIENT, reason=words, code="too_noisy")
     return pose
+
+
+def _seen_from_origin(pose: RackPose, points_m: FloatArray, rack: RackModel) -> RackPose:
+    """The same pose, refused where its face was not seen from the origin."""
+    assert pose.T_camera_rack is not None
+    checks = tuple(viewpoint_checks(points_m, pose.T_camera_rack, rack))
+    said = reason(checks, rack.name)
+    if not said:
+        return replace(pose, checks=pose.checks + checks)
+    return RackPose(RackStatus.REFUSED, said, spacing_m=pose.spacing_m, checks=pose.checks + checks)
 
 
 def _noise_m(points_m: FloatArray, config: Config) -> float:
