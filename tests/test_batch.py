@@ -15,11 +15,13 @@ from tubepose.batch import MOST_ASKED, Job, UnnamedJob, run_jobs, session_jobs, 
 from tubepose.capture.frame import RgbdFrame
 from tubepose.capture.hints import SlotHint
 from tubepose.capture.session import Session, load_session
+from tubepose.checks import Check
 from tubepose.config import Config
 from tubepose.detection import Detection
 from tubepose.detection.geometric import GeometricDetector
 from tubepose.errors import CaptureError, DetectorError
 from tubepose.labware import load_rack, load_tube
+from tubepose.pipeline import Scene, prepare_scene
 from tubepose.rack import RackPose, RackStatus
 from tubepose.records import ESTIMATE_COLUMNS, RACK_COLUMNS, SENSOR_COLUMNS, SLOT_COLUMNS, TIMING_COLUMNS, to_table
 from tubepose.result_tables import Tables
@@ -105,8 +107,34 @@ def test_ctrl_c_keeps_the_rows_of_what_was_done(stop: BaseException) -> None:
     with pytest.raises(KeyboardInterrupt):
         run(job("good", GOOD), cut, job("later", replace(GOOD, capture="later")), tables=tables)
     assert (tables.done, tables.problems) == (1, [])
-    for rows in (tables.racks, tables.slots, tables.estimates, tables.timings):
+    for rows in (tables.racks, tables.slots, tables.estimates, tables.timings, tables.checks, tables.labware_check):
         assert {row["capture"] for row in rows} == {"good"}
+
+
+def test_why_and_which_marks_stand_in_every_table(monkeypatch: pytest.MonkeyPatch) -> None:
+    def marked(frame: RgbdFrame, *rest: Any) -> Scene:
+        scene = prepare_scene(frame, *rest)
+        checks = (*scene.rack_pose.checks, Check("scale", 1.0, 0.5, False, decides=False))
+        return replace(scene, rack_pose=replace(scene.rack_pose, checks=checks))
+
+    monkeypatch.setattr("tubepose.batch.prepare_scene", marked)
+    tables = run(job("good", GOOD), job("bad", make_frame("bad", scale=0.5)), methods=("profile", "paper"))
+    good, bad = ([row for row in tables.racks if row["capture"] == name] for name in ("good", "bad"))
+    assert {(row["reason_code"], row["marks"]) for row in good} == {("", "scale")}
+    assert all(row["reason_code"] and row["status"] != "ok" for row in bad)
+    assert {row["rack_marks"] for row in (*tables.slots, *tables.estimates)} == {"scale"}
+    for row in tables.estimates:
+        assert bool(row["reason_code"]) == bool(row["reason"]) == (row["status"] != "ok")
+    rows = [row for row in tables.checks if row["code"] == "scale" and not row["decides"] and not row["passed"]]
+    assert {(row["subject"], row["slot"], row["method"]) for row in rows} == {
+        ("rack", None, "profile"),
+        ("rack", None, "paper"),
+    }
+    assert {row["slot"] for row in tables.checks if row["subject"] == "tube" and row["method"] == "paper"} == {"B2"}
+    # Sizes are told once a frame, whatever the methods, and of no rack that is not there.
+    sizes = [(row["capture"], row["frame"], row["quantity"], row["labware"]) for row in tables.labware_check]
+    assert len(sizes) == len(set(sizes)) > 0
+    assert {size[0] for size in sizes} == {"good"}
 
 
 def test_a_system_error_that_is_no_ctrl_c_is_raised() -> None:

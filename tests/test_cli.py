@@ -23,6 +23,7 @@ from onnx import TensorProto, helper, numpy_helper
 from tubepose import batch
 from tubepose.capture.mcap_writing import write_mcap
 from tubepose.capture.source import open_captures
+from tubepose.checks import SENTENCES
 from tubepose.config import Config
 from tubepose.detection.box_writing import write_yolo_txt
 from tubepose.detection.geometric import GeometricDetector
@@ -30,7 +31,9 @@ from tubepose.evaluation import AXES
 from tubepose.labware import load_rack, load_tube
 from tubepose.pose_errors import COVARIANCE_COLUMNS
 from tubepose.records import (
+    CHECK_COLUMNS,
     ESTIMATE_COLUMNS,
+    LABWARE_COLUMNS,
     POSE_COLUMNS,
     RACK_COLUMNS,
     RACK_COVARIANCE_COLUMNS,
@@ -106,7 +109,8 @@ def test_estimate_writes_these_files_and_no_others(estimated: tuple[Path, Ended]
     session = table(out / "racks.csv")["session"][0]
     pictures = {f"{session}-{tube}-001-original-0000.png" for tube in SMALL_TUBES}
     assert {path.name for path in (out / "overlays").iterdir()} == pictures
-    files = {"racks.csv", "sensor.csv", "slots.csv", "estimates.csv", "timings.csv", "run.json", "overlays"}
+    tables = ("racks", "sensor", "slots", "estimates", "checks", "labware_check", "timings")
+    files = {*(f"{name}.csv" for name in tables), "run.json", "overlays"}
     assert {path.name for path in out.iterdir()} == files
     assert {path.name for path in out.parent.iterdir()} == {"out"}
 
@@ -117,7 +121,25 @@ def test_estimate_writes_exactly_these_columns(estimated: tuple[Path, Ended]) ->
     assert columns(out / "sensor.csv") == list(SENSOR_COLUMNS)
     assert columns(out / "slots.csv") == list(SLOT_COLUMNS)
     assert columns(out / "estimates.csv") == list(ESTIMATE_COLUMNS)
+    assert columns(out / "checks.csv") == list(CHECK_COLUMNS)
+    assert columns(out / "labware_check.csv") == list(LABWARE_COLUMNS)
     assert columns(out / "timings.csv") == list(TIMING_COLUMNS)
+
+
+def test_every_rack_and_every_tube_has_its_checks(estimated: tuple[Path, Ended]) -> None:
+    out, _ = estimated
+    checks, tubes = table(out / "checks.csv"), table(out / "estimates.csv")
+    assert set(checks["code"]) <= {*SENTENCES, "column_more", "column_fewer"}
+    racks = table(out / "racks.csv")
+    assert set(checks.loc[checks["subject"] == "rack", "capture"]) == set(racks["capture"])
+    checked = set(zip(*(checks.loc[checks["subject"] == "tube", name] for name in ("capture", "slot")), strict=True))
+    assert checked == set(zip(tubes["capture"], tubes["slot"], strict=True))
+    failed = checks[(checks["subject"] == "tube") & ~checks["passed"] & checks["decides"]]
+    rejected = tubes[tubes["status"] == "rejected"]
+    assert set(failed["code"]) >= set(rejected["reason_code"])
+    assert tubes.loc[tubes["status"] == "ok", "reason_code"].fillna("").eq("").all()
+    # Neither of the two methods states a covariance.
+    assert set(tubes["confidence"]) == {""}
 
 
 def test_every_frame_has_its_noise_and_the_run_says_it_in_one_line(estimated: tuple[Path, Ended]) -> None:
@@ -274,12 +296,18 @@ def documented(name: str) -> set[str]:
 @pytest.mark.parametrize(
     "name",
     [
-        "racks", "sensor", "slots", "estimates", "timings", "ground_truth", "errors", "summary", "comparison", "seeds",
+        "racks", "sensor", "slots", "estimates", "checks", "labware_check", "timings", "ground_truth", "errors",
+        "summary", "comparison", "seeds",
         "slot_accuracy", "uncertainty", "coverage", "confusion",
     ],
 )  # fmt: skip
 def test_the_page_and_the_file_have_the_same_columns(name: str, benched: tuple[Path, Ended]) -> None:
     assert documented(name) == set(columns(benched[0] / f"{name}.csv"))
+
+
+def test_the_page_lists_every_code_of_a_check() -> None:
+    told = set(re.findall(r"`(\w+)`", " ".join(re.findall(r"^\|(.+?)\|", sections()["Codes of checks"], re.MULTILINE))))
+    assert told == {*SENTENCES, "column_more", "column_fewer"}
 
 
 def test_the_page_and_the_tables_have_the_same_columns(benched: tuple[Path, Ended]) -> None:

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from tubepose.evaluation import AXES, ERROR_COLUMNS, compare, evaluate, seed_spread, summarise
 from tubepose.labware import load_tube
 from tubepose.pose_errors import add_s_mm, mssd_mm, pose_errors
-from tubepose.transforms import make_transform, quaternion_wxyz
+from tubepose.transforms import make_transform, quaternion_wxyz, translation
 
 TUBES = {name: load_tube(name) for name in ("chen2023-tube-1", "chen2023-tube-2")}
 TUBE = TUBES["chen2023-tube-1"]
@@ -288,6 +288,22 @@ def test_the_second_accepted_estimate_in_a_slot_is_false_and_the_higher_confiden
     here = errors[errors["slot"] == "A1"]
     assert sorted(outcomes(here, trial="a")) == ["false", "ok"]
     assert here.loc[here["outcome"] == "ok", "rx_deg"].tolist() == pytest.approx([1.0])
+
+
+def test_what_is_right_is_within_two_degrees_and_two_millimetres_and_of_its_type():
+    def right(T=CAMERA, std_along_m=1e-4, **more):
+        row = estimate_row("a", "A1", T=T, **more)
+        errors = evaluate(table([row]).assign(cov_tz_tz=std_along_m**2), TRUTH, TUBES, ["paper"])
+        return errors.loc[(errors["trial"] == "a") & (errors["slot"] == "A1"), "right"].tolist()
+
+    up = CAMERA @ translation([0, 0, 2.1e-3])
+    assert right() == right(T=CAMERA @ turned(x_deg=1.9)) == [True]
+    assert right(T=CAMERA @ turned(x_deg=2.1)) == right(T=CAMERA @ translation([2.1e-3, 0, 0])) == [False]
+    # Along the axis it counts where that is known.
+    assert right(T=up) == [False]
+    assert right(T=up, std_along_m=1.1e-3) == [True]
+    assert right(tube="chen2023-tube-2") == [False]
+    assert evaluate(table([]), TRUTH, TUBES, ["paper"])["right"].isna().all()
 
 
 def test_an_accepted_estimate_in_no_slot_is_false():

@@ -19,11 +19,13 @@ from tubepose.labware_check import (
 from tubepose.rack import RackPose, RackStatus
 from tubepose.rack.size import FaceSize
 from tubepose.scene import Scene, TubeEstimate, TubeTarget
+from tubepose.sensor import prior_noise
 from tubepose.tube import TopMeasure, TubePose, TubeStatus
 from tubepose.tubes_pitch import LEAST_TOPS, refuse_by_tops
 from tubepose_cli.show import describe_sizes
 
 CONFIG = Config()
+NOISE = prior_noise(CONFIG.sensor, "not measured")
 RACK = load_rack("chen2023-soft-5x10")
 OPEN, LOW, HIGH = (load_tube(f"chen2023-tube-{k}") for k in (1, 2, 3))
 CAMERA = np.array([[1.0, 0, 0, 0], [0, -1, 0, 0], [0, 0, -1, 0.7], [0, 0, 0, 1]])
@@ -34,7 +36,7 @@ UNSEEN = replace(AS_DEFINED, covariance=np.diag(np.square([0.03, 0.03, 1.5e-3, 1
 def a_scene(size=AS_DEFINED, tubes=(LOW, HIGH), **of_pose):
     pose = {"T_camera_rack": CAMERA, "size": size, "resolved_by": "geometry"} | of_pose
     rack_pose = RackPose(pose.pop("status", RackStatus.OK), **pose)
-    return Scene(None, RACK, tubes, None, (), rack_pose, None, (), ())
+    return Scene(None, RACK, tubes, None, (), rack_pose, NOISE, (), ())
 
 
 def an_estimate(slot, tube=LOW, off_mm=(0.0, 0.0), high_mm=0.0, wide_mm=0.0, code=""):

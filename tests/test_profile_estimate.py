@@ -387,5 +387,5 @@ def test_types_with_the_same_top_are_not_told_apart(frame):
     alike = {slot for slot, (tube, _) in PLACED.items() if tube is HIGH}
     assert {slot for slot, entry in tubes.items() if entry.pose.status is not TubeStatus.OK} == alike
     for slot in alike:
-        assert tubes[slot].pose.reason_code == "unknown_type"
+        assert tubes[slot].pose.reason_code == "type_not_told"
         assert "fit alike" in tubes[slot].pose.reason

@@ -80,5 +80,7 @@ def test_types_by_their_support():
     assert p_type(0.8, 0.8, 7e-3) == 0.5
     assert p_type(0.8, -np.inf, 7e-3) == pytest.approx(1.0)
     assert p_type(0.8, 0.6, 7e-3) == pytest.approx(1 - p_type(0.6, 0.8, 7e-3))
+    # Log odds of height and radius, where there are some, have the last word.
+    assert p_type(0.8, 0.1, 7e-3, np.log(99)) == pytest.approx(0.99)
     # A larger top has more patches that tell.
     assert 0.5 < p_type(0.8, 0.75, 5e-3) < p_type(0.8, 0.75, 8e-3) < 1

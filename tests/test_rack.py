@@ -352,6 +352,7 @@ def test_a_rack_of_another_size_is_not_found(soft_scan):
     pose = register_rack(soft_scan, load_rack("round-10ml-3x4"), CONFIG)
     assert pose.status is RackStatus.NOT_FOUND
     assert "no top of round-10ml-3x4 (130 x 90 mm)" in pose.reason
+    assert pose.reason_code
     assert pose.T_camera_rack is None
 
 
@@ -379,7 +380,7 @@ def test_a_wrong_unit_is_the_suspect_and_names_the_factor(rack, factor, words):
     assert pose.status is RackStatus.UNIT
     assert pose.T_camera_rack is None
     assert words in pose.reason
-    assert "unit" in pose.reason
+    assert pose.reason_code == "wrong_unit"
 
 
 def test_a_wrong_unit_is_not_suspected_of_another_rack(soft_scan):
@@ -392,13 +393,15 @@ def test_a_wrong_unit_is_not_suspected_of_another_rack(soft_scan):
 def test_too_few_points(soft_scan, count):
     pose = register_rack(soft_scan[:count], SOFT, CONFIG)
     assert pose.status is RackStatus.INSUFFICIENT
-    assert pose.reason == f"{count} valid points on the rack, expected at least 50"
+    assert pose.reason_code == "too_few_points"
+    assert f"{count} valid points" in pose.reason
 
 
 def test_a_scan_coarser_than_the_ribs_is_insufficient():
     scan = scenes.rack_top(SOFT, spacing_m=2.2e-3)
     pose = register_rack(transform_points(T_CAMERA_SOFT, scan), SOFT, CONFIG)
     assert pose.status is RackStatus.INSUFFICIENT
+    assert pose.reason_code == "too_coarse"
     assert "mm apart, and the ribs of chen2023-soft-5x10 are 1.20 mm wide" in pose.reason
     assert pose.spacing_m > SOFT.min_rib_m
     assert pose.T_camera_rack is None
@@ -409,6 +412,7 @@ def test_noisy_depth_is_insufficient(soft_scan):
     noisy = soft_scan + along * np.random.default_rng(0).normal(0, 3e-3, (len(soft_scan), 1))
     pose = register_rack(noisy, SOFT, CONFIG)
     assert pose.status is RackStatus.INSUFFICIENT
+    assert pose.reason_code == "too_noisy"
     assert "depth scatters by" in pose.reason
     assert "at most 1.1 mm" in pose.reason
     assert pose.T_camera_rack is None

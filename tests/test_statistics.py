@@ -3,7 +3,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from tubepose.statistics import coverage_curve, paired_bootstrap
+from tubepose.statistics import coverage_curve, paired_bootstrap, weighted_mean
 
 
 def test_the_interval_is_that_of_a_mean_when_every_group_has_one_value():
@@ -87,3 +87,10 @@ def test_equal_scores_are_kept_together_and_nan_is_left_out():
     assert curve.mean_error.tolist() == pytest.approx([0.0, 4 / 3])
     empty = coverage_curve(np.array([np.nan]), np.array([1.0]))
     assert empty.coverage.shape == (0,)
+
+
+def test_a_weighted_mean_by_hand_and_what_contradicts_itself():
+    assert weighted_mean(np.array([1.0, 3.0]), np.array([1.0, 2.0])) == pytest.approx((1.4, np.sqrt(0.8)))
+    assert weighted_mean(np.array([2.5]), np.array([0.3])) == pytest.approx((2.5, 0.3))
+    # Ten standard deviations apart: the mean is as sure as half of that.
+    assert weighted_mean(np.array([0.0, 10.0]), np.array([1.0, 1.0])) == pytest.approx((5.0, 5.0))

@@ -128,6 +128,7 @@ SENTENCES = {
     "types_alike": "{value:.1f} mm high: {detail} are not told apart by height",
     "tube_in_box_only": "a tube is detected here, but {detail}",
     "unknown_type": "{detail}",
+    "type_not_told": "{detail}",
     "lies_across": "{detail}",
     "second_top": "{detail}",
     "part_of_top": "{detail}",

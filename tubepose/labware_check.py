@@ -174,7 +174,8 @@ def _tube_sizes(scene: Scene, estimates: Sequence[TubeEstimate], config: Config)
         wide = wide[np.isfinite(wide)]
         if len(wide) and tube.cap is not None:
             # Blur moves the ends of all caps alike: more caps do not take that away.
-            blur_mm = 2e3 * config.profile.widening_m
+            ends_m = scene.noise.edge_blur_px * scene.noise.spacing_m / float(np.sqrt(12))
+            blur_mm = 2e3 * float(np.hypot(config.profile.widening_m, ends_m))
             std = float(np.hypot(_scatter(wide) / np.sqrt(len(wide)), blur_mm))
             found, defined = float(np.median(wide)), tube.cap.diameter_mm
             yield SizeCheck(

@@ -15,9 +15,11 @@ from tubepose.profile.kernels import cell_values, crowded_ends, ends_on_planes, 
 from tubepose.profile.leftovers import NO_TOP, STRANGE_TOP, Leftover
 from tubepose.profile.outline import NORMALS, OUTLINE_DEPTH_M, Circles, fit_discs
 from tubepose.profile.plane import TopPlanes, fit_top_planes, top_spacing_m, unknown_planes
+from tubepose.profile.posterior import per_model
 from tubepose.profile.standing import Standing
 from tubepose.profile.tops import Tops, mouth_radius_m, top_level_m, top_radius_m
 from tubepose.transforms import FloatArray
+from tubepose.tube import TopMeasure
 
 ON_PLANE_SHARE = 1 / 3
 """Points of a circle lie this near its top's plane, as a share of the band that grows with the sensor's noise."""
@@ -43,6 +45,8 @@ class Measured:
         label: Tube of each point, shape (N,), `NO_TOP` for none, `STRANGE_TOP` for one of no given type.
         points: The points.
         strangers: Tops of no given type, or of which the type is not known.
+        type_odds: Log odds of each top's type against all others, shape (T,), nats; NaN of open ones. None before
+            types are told.
     """
 
     tops: Tops
@@ -53,6 +57,7 @@ class Measured:
     label: NDArray[np.intp]
     points: Standing
     strangers: tuple[Leftover, ...] = ()
+    type_odds: FloatArray | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -110,7 +115,8 @@ def name_measured(
         names, radius_m = _names(found, rack, tubes, config, allowed)
     # How well another type would cover the points is no question where its height and its radius were measured.
     runner_up = np.where(shape.open, found.tops.runner_up, -np.inf)
-    found = replace(found, tops=replace(found.tops, runner_up=runner_up))
+    type_odds = np.where(shape.open, np.nan, names.odds)
+    found = replace(found, tops=replace(found.tops, runner_up=runner_up), type_odds=type_odds)
     strange = np.flatnonzero(~shape.open & (names.odds < config.min_type_odds))
     strangers = []
     for t in strange:
@@ -119,7 +125,8 @@ def name_measured(
             float(found.level_m[t]), float(radius_m[t]), (tubes[found.tops.tube[t]], rival), float(names.odds[t]), rack,
             config.min_type_odds,
         )  # fmt: skip
-        strangers.append(Leftover(int(found.tops.slot[t]), words, np.flatnonzero(found.label == t)))
+        code = "unknown_type" if rival is None else "type_not_told"
+        strangers.append(Leftover(int(found.tops.slot[t]), words, np.flatnonzero(found.label == t), code))
     return _without(found, strange, tuple(strangers)) if strangers else found
 
 
@@ -155,8 +162,30 @@ def _without(found: Measured, strange: NDArray[np.intp], strangers: tuple[Leftov
     planes = TopPlanes(*(getattr(found.planes, field.name)[kept] for field in fields(TopPlanes)))
     return Measured(
         found.tops.take(kept), found.center_m[kept], found.level_m[kept], planes, found.circles.take(kept),
-        number[found.label], found.points, strangers,
+        number[found.label], found.points, strangers, None if found.type_odds is None else found.type_odds[kept],
     )  # fmt: skip
+
+
+def top_measures(
+    measured: Measured, upright: FloatArray, models: Sequence[TubeModel], rack: RackModel
+) -> list[TopMeasure]:
+    """What was measured of the tops of tubes, to compare with their definitions.
+
+    Args:
+        measured: The tops, T of them.
+        upright: Cosines of their axes' tilts, shape (T,).
+        models: Their types.
+        rack: The rack.
+    """
+    held, radius = per_model(models, lambda tube: (tube.pivot_height_m, top_radius_m(tube))).reshape(-1, 2).T
+    height = (measured.planes.height_m - rack.floor_m - held) / upright + held
+    closed = np.isfinite(measured.planes.height_m)
+    diameter = np.where(closed, 2 * (radius + measured.circles.widening_m), np.nan)
+    # A closed top's normal is its axis: it leads down to the rack's face.
+    down = (measured.level_m - rack.height_m)[:, None] * measured.planes.slope
+    off = measured.center_m + down - rack.slot_centers_m[measured.tops.slot]
+    columns = zip(height.tolist(), diameter.tolist(), off.tolist(), strict=True)
+    return [TopMeasure(high, wide, (x, y)) for high, wide, (x, y) in columns]
 
 
 def label_points(standing: Standing, center_m: FloatArray, radius_m: FloatArray) -> NDArray[np.intp]:

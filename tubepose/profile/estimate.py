@@ -15,7 +15,7 @@ from tubepose.config import Config, ProfileConfig
 from tubepose.labware import RackModel, TubeModel
 from tubepose.preprocessing import TALLEST_TUBE_M
 from tubepose.profile.bowed import FaceBow, SlotFrame, in_rack_frame, slot_frame
-from tubepose.profile.closed_tops import Measured
+from tubepose.profile.closed_tops import Measured, top_measures
 from tubepose.profile.floor import SETTLED_MM, settle_floor
 from tubepose.profile.fusing import fuse, pose_covariance, rise_m
 from tubepose.profile.kernels import grouped
@@ -251,7 +251,9 @@ def _poses(
         "spacing_m": top_spacing_m(measured.planes, per_model(models, top_radius_m)),
     }
     columns = [values.tolist() for values in verdicts.values()]
-    sure, measures = confidence(covariance), _top_measures(measured, axis[:, 2], models, rack)
+    sure, measures = confidence(covariance), top_measures(measured, axis[:, 2], models, rack)
+    odds = np.full(len(models), np.nan) if measured.type_odds is None else measured.type_odds
+    of_type = [p_type(tops.support[i], tops.runner_up[i], top_radius_m(tube), odds[i]) for i, tube in enumerate(models)]
     limits = height_limit_m(noise.height_var_m2, config).tolist()
     found = []
     for i, (tube, *values) in enumerate(zip(models, *columns, strict=True)):
@@ -264,7 +266,7 @@ def _poses(
                 TubeStatus.REJECTED if reason else TubeStatus.OK,
                 reason,
                 T[i],
-                confidence=float(sure[i]) * p_type(tops.support[i], tops.runner_up[i], top_radius_m(tube)),
+                confidence=float(sure[i]) * of_type[i],
                 inlier_rmse_m=float(measured.planes.rms_m[i]),
                 fitness=told["sectors"],
                 n_points=len(clouds[i]),
@@ -274,21 +276,6 @@ def _poses(
             )
         )
     return found
-
-
-def _top_measures(
-    measured: Measured, upright: FloatArray, models: Sequence[TubeModel], rack: RackModel
-) -> list[TopMeasure]:
-    """What was measured of the tops, T of them; `upright` are the cosines of their axes' tilts, shape (T,)."""
-    held, radius = per_model(models, lambda tube: (tube.pivot_height_m, top_radius_m(tube))).reshape(-1, 2).T
-    height = (measured.planes.height_m - rack.floor_m - held) / upright + held
-    closed = np.isfinite(measured.planes.height_m)
-    diameter = np.where(closed, 2 * (radius + measured.circles.widening_m), np.nan)
-    # A closed top's normal is its axis: it leads down to the rack's face.
-    down = (measured.level_m - rack.height_m)[:, None] * measured.planes.slope
-    off = measured.center_m + down - rack.slot_centers_m[measured.tops.slot]
-    columns = zip(height.tolist(), diameter.tolist(), off.tolist(), strict=True)
-    return [TopMeasure(high, wide, (x, y)) for high, wide, (x, y) in columns]
 
 
 def _rejected(pose: TubePose, check: Check) -> TubePose:

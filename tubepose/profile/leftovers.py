@@ -36,7 +36,8 @@ class Leftover:
         slot: Index of the slot that it stands in, or None.
         reason: What it looks like, in words.
         rows: Rows of the standing points that it is made of.
-        code: What it looks like: ``unknown_type``, ``lies_across``, ``second_top`` or ``part_of_top``.
+        code: What it looks like: ``unknown_type``, ``type_not_told``, ``lies_across``, ``second_top`` or
+            ``part_of_top``.
     """
 
     slot: int | None

@@ -70,13 +70,15 @@ def tube_checks(
     return tuple(checks())
 
 
-def p_type(support: float, runner_up: float, radius_m: float) -> float:
-    """Probability that a top is of its type and not of the next best one (naive Bayes over patches, equal priors).
+def p_type(support: float, runner_up: float, radius_m: float, odds: float = float("nan")) -> float:
+    """Probability that a top is of its type: by log odds, else against the next best type (naive Bayes over patches).
 
     Args:
         support: Share of its top that is seen, less that of its surroundings.
         runner_up: The same of the next best type; minus infinity without one.
         radius_m: Radius of its top, metres: how many patches the shares are of.
+        odds: Log odds of its type against all others, nats, where they are known; NaN where they are not.
     """
-    patches = np.pi * (radius_m / PATCH_M) ** 2
-    return float(1 / (1 + np.exp(-np.clip(PATCH_NATS * patches * (support - runner_up), -50.0, 50.0))))
+    if not np.isfinite(odds):
+        odds = PATCH_NATS * np.pi * (radius_m / PATCH_M) ** 2 * (support - runner_up)
+    return float(1 / (1 + np.exp(-np.clip(odds, -50.0, 50.0))))
