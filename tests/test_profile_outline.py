@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tubepose.config import ProfileConfig
-from tubepose.profile.measure import DISC_GAP_M, blocked_sectors
+from tubepose.profile.closed_tops import DISC_GAP_M, blocked_sectors
 from tubepose.profile.outline import ANGLES, NORMALS, SECTORS, fit_circles, fit_discs, unknown_circles
 
 CONFIG = ProfileConfig()
