@@ -25,12 +25,13 @@ POSE_COLUMNS = ("tx_m", "ty_m", "tz_m", "qw", "qx", "qy", "qz")
 RACK_COVARIANCE_AXES = ("rx", "ry", "rz", "tx", "ty", "tz")
 """Order of a rack's covariance: small turns about its axes and shifts along them, at the centre of its top."""
 RACK_COVARIANCE_COLUMNS = upper_half(RACK_COVARIANCE_AXES)
+BOW_COLUMNS = ("bow_x_m", "bow_y_m", "bow_xy_m", "bow_x_std_m", "bow_y_std_m", "bow_xy_std_m")
 RACK_COLUMNS = (
     "session", "trial", "capture", "frame", "timestamp_ns", "method", "rack", "status", "reason", "reason_code",
     "marks", "ambiguous",
     "resolved_by", "hint_note", "turn_margin_m", "inlier_rmse_m", "fitness", "in_slot_share", "coverage", "spacing_m",
     "level_tops", "n_racks_detected", "n_tubes_detected", "box_source", "box_score", "box_note", *POSE_COLUMNS,
-    "named_by_nats", *RACK_COVARIANCE_COLUMNS,
+    "named_by_nats", *BOW_COLUMNS, *RACK_COVARIANCE_COLUMNS,
 )  # fmt: skip
 SENSOR_COLUMNS = (
     "session", "trial", "capture", "frame", "timestamp_ns", "source", "independent_m", "independent_relative_std",
@@ -148,8 +149,15 @@ def rack_pose_row(frame: RgbdFrame, pose: RackPose) -> Row:
         "spacing_m": pose.spacing_m,
         "level_tops": pose.level_tops,
         **pose_columns(pose.T_camera_rack),
+        **_bow_columns(pose),
         **covariance_columns(pose.covariance, RACK_COVARIANCE_COLUMNS),
     }
+
+
+def _bow_columns(pose: RackPose) -> Row:
+    if pose.bow_m is None or pose.bow_std_m is None:
+        return dict.fromkeys(BOW_COLUMNS, float("nan"))
+    return dict(zip(BOW_COLUMNS, map(float, (*pose.bow_m, *pose.bow_std_m)), strict=True))
 
 
 def sensor_row(keys: Row, frame: RgbdFrame, noise: SensorNoise) -> Row:

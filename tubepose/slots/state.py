@@ -30,9 +30,9 @@ MOST_DISSENT = 0.25
 """Patches that say the opposite, as a share of those for a state, above which it is not stated: five times what ghosts
 are expected to be, so that something else is there, a clear tube say."""
 LEAST_COVERED = 0.5
-"""Least covered share of a slot's middle for something that no method found to be a thing that stands there: a top
-returns from most of its area (0.64 and more in simulated racks), the edge of a neighbour's cap that reaches over the
-slot and the ghosts behind a clear wall from little of it (up to 0.16)."""
+"""Least share of a slot that is covered (of its middle) or filled below the face for what no method found to be a thing
+that stands there: a top returns from most of its area (0.64 and more in simulated racks), the edge of a neighbour's cap
+that reaches over the slot and the ghosts behind a clear wall from little of it (up to 0.16)."""
 SURE = 0.95
 """A state is stated from this probability on: with the model's patches, from one more for it than against it."""
 
@@ -117,7 +117,7 @@ def state_slot(look: SlotLook | None, finding: Finding) -> StatedSlot:
         return StatedSlot(SlotState.NOT_SEEN if finding is Finding.NONE else SlotState.UNCLEAR, p, share)
     passed, stopped = look.patches_passed, look.patches_stopped
     state = SlotState.UNCLEAR
-    solid = finding is not Finding.NONE or look.covered >= LEAST_COVERED
+    solid = finding is not Finding.NONE or look.covered + look.filled >= LEAST_COVERED
     if p >= SURE and passed <= MOST_DISSENT * stopped and solid:
         state = SlotState.OCCUPIED
     elif p <= 1 - SURE and stopped <= MOST_DISSENT * passed and finding is Finding.NONE:
