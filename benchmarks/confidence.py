@@ -3,9 +3,9 @@
     python -m benchmarks.confidence [--captures N] [--seed S] [--noise MM,MM,...]
 
 SIMULATED scenes, as those of `benchmarks.coverage_factors` in its middle, at several levels of depth noise of which
-half is shared. Counted are all tubes of `profile` that have a pose and a slot that holds a tube: accepted ones, and rejected
-ones beside them. Right is as in `tubepose.confidence`, and of the right type. Names of slots do not count: a rack that
-may stand either way round has two for every tube.
+half is shared. Counted are all tubes of `profile` that have a pose and a slot that holds a tube: accepted ones, and
+rejected ones beside them. Right is as in `tubepose.confidence`, and of the right type. Names of slots do not count: a
+rack that may stand either way round has two for every tube.
 """
 
 from __future__ import annotations
