@@ -2,16 +2,17 @@
 
     python -m benchmarks.confidence [--captures N] [--seed S] [--noise MM,MM,...]
 
-SIMULATED scenes, as those of `benchmarks.coverage_factors` in its middle, at several levels of depth noise of which half
-is shared. Counted are all tubes of `profile` that have a pose and a slot that holds a tube: accepted ones, and rejected
-ones beside them. Right is as in `tubepose.confidence`, and of the right type. Names of slots do not count: a rack that
-may stand either way round has two for every tube.
+SIMULATED scenes, as those of `benchmarks.coverage_factors` in its middle, at several levels of depth noise of which
+half is shared. Counted are all tubes of `profile` that have a pose and a slot that holds a tube: accepted ones, and
+rejected ones beside them. Right is as in `tubepose.confidence`, and of the right type. Names of slots do not count: a
+rack that may stand either way round has two for every tube.
 """
 
 from __future__ import annotations
 
 import argparse
 import dataclasses
+from itertools import pairwise
 
 import numpy as np
 
@@ -76,7 +77,7 @@ def show(name: str, rows: list[tuple[float, bool, bool]]) -> None:
     """Lines of one level of noise."""
     for accepted in (True, False):
         of = np.array([(sure, right) for sure, right, ok in rows if ok == accepted]).reshape(-1, 2)
-        for low, high in zip(BINS[:-1], BINS[1:], strict=True):
+        for low, high in pairwise(BINS):
             here = of[(of[:, 0] > low) & (of[:, 0] <= high)]
             if len(here):
                 cells = (f"{low:g} to {high:g}", len(here), f"{here[:, 0].mean():.3f}", f"{here[:, 1].mean():.3f}")

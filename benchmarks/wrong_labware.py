@@ -34,11 +34,11 @@ from benchmarks.wrong_labware_scenes import SETS, View, view
 from tubepose.config import Config
 from tubepose.detection.geometric import GeometricDetector
 from tubepose.errors import TubePoseError
-from tubepose.tubes_pitch import refuse_by_tops
 from tubepose.pipeline import DEFAULT_METHOD, Scene, estimate_tubes, prepare_scene
 from tubepose.provenance import pinned_threads
 from tubepose.records import estimate_row, rack_row, slot_rows
 from tubepose.simulation import SENSORS
+from tubepose.tubes_pitch import refuse_by_tops
 
 FULL_FRAMES = 500
 MOST_WORKERS = 2
