@@ -13,15 +13,16 @@ from unittest.mock import patch
 import numpy as np
 
 from tubepose.pipeline import Scene, TubeEstimate
-from tubepose.profile import estimate, fusing, measure
+from tubepose.profile import closed_tops, estimate, fusing, measure
 from tubepose.transforms import transform_points
 
 STAGES: dict[str, tuple[ModuleType, tuple[str, ...]]] = {
     "gather": (measure, ("gather_standing",)),
     "find tops": (measure, ("find_tops",)),
-    "label": (measure, ("label_points",)),
-    "planes": (measure, ("fit_top_planes",)),
-    "outlines": (measure, ("fit_discs",)),
+    "label": (closed_tops, ("label_points",)),
+    "planes": (closed_tops, ("fit_top_planes",)),
+    "outlines": (closed_tops, ("fit_discs",)),
+    "types": (closed_tops, ("name_tops",)),
     "rims": (measure, ("fit_rims",)),
     "faint rims": (measure, ("find_faint_rims",)),
     "leftovers": (estimate, ("find_leftovers",)),

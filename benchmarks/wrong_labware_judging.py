@@ -93,7 +93,6 @@ class Verdict:
         racks: Racks accepted, 0 or 1.
         ambiguous: Accepted ones that are marked ambiguous.
         needless: Of these, ones whose true rack looks the same under no turn.
-        marked: Accepted ones that are off at their face and say so: their scale is marked.
         tubes: Tubes stated.
         kept: True tubes that a stated one without any fault belongs to.
         not_stated: Slots of the accepted rack that are called neither empty nor occupied.
@@ -107,12 +106,12 @@ class Verdict:
         wrong_tubes: Stated tubes with any fault of the five above.
         false_empty: Slots that are called empty and hold a tube.
         false_occupied: Slots that are called occupied and hold none.
+        marked: Accepted racks that are off at their face and say so: their scale is marked.
     """
 
     racks: int = 0
     ambiguous: int = 0
     needless: int = 0
-    marked: int = 0
     tubes: int = 0
     kept: int = 0
     not_stated: int = 0
@@ -126,6 +125,7 @@ class Verdict:
     wrong_tubes: int = 0
     false_empty: int = 0
     false_occupied: int = 0
+    marked: int = 0
 
     @property
     def wrong(self) -> int:
