@@ -33,6 +33,8 @@ BOX_MARGIN_M = 10e-3
 TALLEST_M = 0.2
 WRONG_MM, WRONG_DEG = 0.5, 0.2
 METHODS = ("edges", "obb-icp")
+BOWS_M = ((0.0, 0.0), (2.5e-3, 2.5e-3), (-2.5e-3, -2.5e-3), (2.5e-3, -2.5e-3))
+"""Added to a scan's face, at the ends of its x axis and of its y axis."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -228,11 +230,27 @@ def scan_table(file: Path, rack: RackModel, starts: int) -> None:
     name = pose.rack.name if pose.rack is not None else pose.reason
     print(f"{len(points)} points; named: {name}, ahead by {pose.named_by_nats:.0f} nats")
     print(f"log likelihoods: {told}")
+    for bow_m in BOWS_M:
+        print(f"with {bow_m[0] * 1e3:+g}, {bow_m[1] * 1e3:+g} mm of bow added: {_bow_words(points, pose, rack, bow_m)}")
     rng = np.random.default_rng(0)
     for drop in (0.0, 0.5):
         found = [_repeat(points[rng.random(len(points)) >= drop], rack, rng) for _ in range(starts)]
         poses = np.array([T for T in found if T is not None])
         print(f"drop-out {drop:.0%}: {len(poses)} of {starts} accepted; " + _spread(poses, rack))
+
+
+def _bow_words(points_m: FloatArray, pose: RackPose, rack: RackModel, bow_m: tuple[float, float]) -> str:
+    """What becomes of a scan whose face is bowed more, at the ends of its x axis and of its y axis, metres."""
+    if pose.T_camera_rack is None:
+        return "no pose to add it in"
+    local = transform_points(invert_transform(pose.T_camera_rack), points_m)
+    u, v = (2 * local[:, :2] / rack.outline_m).T
+    local[:, 2] += bow_m[0] * u**2 + bow_m[1] * v**2
+    bowed = register_rack(transform_points(pose.T_camera_rack, local), rack, Config())
+    if bowed.bow_m is None or bowed.bow_std_m is None:
+        return f"{bowed.status.value}: {bowed.reason}"
+    found = ", ".join(f"{1e3 * b:.2f} +- {1e3 * std:.2f}" for b, std in zip(bowed.bow_m, bowed.bow_std_m, strict=True))
+    return f"{bowed.status.value}, bow {found} mm"
 
 
 def _repeat(points_m: FloatArray, rack: RackModel, rng: np.random.Generator) -> FloatArray | None:

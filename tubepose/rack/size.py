@@ -29,8 +29,8 @@ LONGEST = np.array([5e-3, 0.7e-3, 0.7e-3, 0.01, 0.01, 0.7e-3, 0.7e-3, 0.7e-3])
 # Cells this far beyond an edge are of no use.
 REACH_M = 6e-3
 CLUSTER_M = 20e-3
-# Where ribs are missed their edges are those of what is missed: on the one REAL scan with a quarter of its face missing
-# the pitch came out wrong by 4 of its standard deviations. They grow by this times the share that is missed.
+# Where ribs are missed their edges are those of what is missed, which no square knows of: standard deviations grow by
+# this times the share that is missed. (Chosen on one REAL scan, a quarter of whose face is missing.)
 PATCHY = 10.0
 # Where more of the solid cells beside what stands up return nothing, edges there are those of shadows.
 MOST_HIDDEN = 0.12
