@@ -110,8 +110,8 @@ class RackConfig(_Section):
             rack of another pitch 12 % or more.
         max_outside_share: Largest share of the top's points just outside the outline (right rack: 0.1 %).
         max_gain: Nats by which a named alternative (a row or column more or fewer, no openings, another rack of the
-            catalogue) may be likelier than the rack; `python -m benchmarks.rack_checks` prints what right files and wrong
-            ones give.
+            catalogue) may be likelier than the rack; `python -m benchmarks.rack_checks` prints what right and wrong
+            files give.
         max_pitch_mm: How far the outermost slots may lie from where the rack's file has them, because of another pitch;
             beyond three standard deviations of its measurement, as with those below. Half of what a wrong answer is.
         max_openings_mm: How much wider or narrower openings may be: blur moves their edges by up to 0.6 mm each.
