@@ -84,17 +84,21 @@ class SensorNoise:
             radius_m: Radius of the disc, metres.
             distance_m: Its depth along the optical axis, metres.
         """
-        radius = radius_m * self.distance_m / distance_m
+        radius = radius_m * self._nearer(distance_m)
         measured = [(disc.radius_m, disc.slope_std / self._model_slope(disc.radius_m)) for disc in self.discs]
         # Errors grow with the distance as the pixels' footprint does: the slope of equal pixels stays.
         return self._model_slope(radius) * _between(radius, measured)
 
     def height_std_m(self, radius_m: float, distance_m: float) -> float:
         """Standard deviation of the mean height of a disc of points, metres; arguments as of `slope_std`."""
-        scale = self.distance_m / distance_m
+        scale = self._nearer(distance_m)
         radius = radius_m * scale
         measured = [(disc.radius_m, disc.height_std_m / self._model_height(disc.radius_m)) for disc in self.discs]
         return self._model_height(radius) * _between(radius, measured) / scale
+
+    def _nearer(self, distance_m: float) -> float:
+        """By how much the reference is farther; 1 where a depth is none, as in a cloud whose z is no optical axis."""
+        return self.distance_m / distance_m if self.distance_m > 0 and distance_m > 0 else 1.0
 
     def _model_slope(self, radius_m: float) -> float:
         own = (self.independent_m * self.spacing_m) ** 2 / (np.pi * radius_m**2)
