@@ -117,7 +117,8 @@ class RackConfig(_Section):
         max_openings_mm: How much wider or narrower openings may be: blur moves their edges by up to 0.6 mm each.
         max_outline_mm: How much larger or smaller the outline may be.
         max_scale: Largest difference of scale, as a share, of everything that is seen of the rack.
-        max_scale_shift_mm: A difference of scale that moves the rack by more along the line of sight is marked.
+        max_scale_shift_mm: A difference of scale that moves the rack by more along the line of sight is marked, beyond
+            two standard deviations.
         edge_std_mm: How far a sensor's blur and a projector's shadow move the edge of an outline.
         max_tops_off: How far the tops of what stands in the slots may lie from the slots' centres, median, as a share
             of the distance of slots: tubes lean by a tenth, and tops anywhere give 0.4.
@@ -160,7 +161,7 @@ class RackConfig(_Section):
     max_openings_mm: float = 2.0
     max_outline_mm: float = 6.0
     max_scale: float = 0.0075
-    max_scale_shift_mm: float = 2.0
+    max_scale_shift_mm: float = 1.2
     edge_std_mm: float = 0.3
     max_tops_off: float = 0.25
     max_bow_mm: float = 4.0

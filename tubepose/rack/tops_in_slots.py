@@ -19,10 +19,11 @@ from tubepose.transforms import FloatArray, parts
 # What stands out of a rack is looked for from here to there above its top.
 LOW_M, HIGH_M = 5e-3, 0.15
 POINTS_PER_SLOT = 160
-# A top is the fullest height within this share of the distance to the next slot, and all of that height within a half.
+# A top is the fullest height within this share of the distance to the next slot, and all of that height within a half;
+# it has so many points there, and this share of them.
 CORE, WINDOW = 0.3, 0.5
 BIN_M = 2e-3
-LEAST_POINTS = 20
+LEAST_POINTS, LEAST_SHARE = 20, 0.7
 # A top is moved onto its own points' middle so often.
 SHIFTS = 4
 # So many tops in two rows or columns tell a pitch.
@@ -90,6 +91,9 @@ def _middle(apart_m: FloatArray, heights_m: FloatArray, pitch_m: float) -> Float
         return None
     counts = np.bincount((heights_m[core] / BIN_M).astype(int))
     level = (int(counts.argmax()) + 0.5) * BIN_M
+    # Light behind clear walls comes from all heights.
+    if np.mean(np.abs(heights_m[core] - level) < BIN_M) < LEAST_SHARE:
+        return None
     at = apart_m[np.abs(heights_m - level) < BIN_M]
     middle = np.zeros(2)
     for _ in range(SHIFTS):
