@@ -32,6 +32,8 @@ LOST_DEG = 45.0
 CORE, FULL = 0.25, 0.6
 # Tops in so many of the slots tell that they are there: a few are ghosts of clear walls.
 TOPS_SHARE = 0.2
+# Tubes stand so far out of a rack, about.
+OVER_M = 50e-3
 # A floor is seen in slots with so many points, this near to each other in height, away from walls and from the face.
 FLOOR_POINTS = 12
 FLOOR_SAMPLE = 60_000
@@ -88,7 +90,7 @@ def prove(points_m: FloatArray, fit: Fit, seen: Agreement, rack: RackModel, conf
     size, floor_m = measure_size(face, rack).with_tops(tops), measure_floor(points_m, fit, rack)
     checks = (
         *_alternatives(face, rack, config),
-        *_beside(face, rack),
+        *_beside(face, fit.bow_m, rack),
         *_tops(tops, rack, config),
         *_sizes(size, rack, config),
         *_scale(size, rack, float(np.linalg.norm(T_camera_top[:3, 3])), config),
@@ -125,26 +127,31 @@ def _alternatives(face: Face, rack: RackModel, config: RackConfig) -> Iterator[C
         yield Check(gain.code, gain.nats, config.max_gain, gain.nats <= config.max_gain, detail=gain.words)
 
 
-def _beside(face: Face, rack: RackModel) -> Iterator[Check]:
-    """Tubes that stand where another line of slots would be: full places in more than one slot of it."""
+def _beside(face: Face, bow_m: FloatArray, rack: RackModel) -> Iterator[Check]:
+    """Tubes that stand where another line of slots would be: full places in more than one slot of it.
+
+    Those of a bowed rack stand along its face's normal, and lean over the places beside it.
+    """
+    half = rack.outline_m / 2
     steps = line_steps_m(rack)
-    for side, sign in SIDES.items():
+    for where, sign in SIDES.items():
         axis = 0 if sign[0] else 1
         step = steps[axis]
         if step is None:
             continue
         full = 0
         for slot in edge_slots(rack.all_slots, np.array(sign) * step):
+            place = slot.center_m + np.array(sign) * step
+            uv = place / half
+            place = place - OVER_M * (2 * bow_m[:2] * uv + bow_m[2] * uv[::-1]) / half
             low, high = (
-                np.floor(
-                    (slot.center_m + np.array(sign) * step - face.grid.low_m) / face.grid.cell_m + side_cells
-                ).astype(int)
-                for side_cells in (0.5 - CORE * step / face.grid.cell_m, 0.5 + CORE * step / face.grid.cell_m)
+                np.floor((place + side * CORE * step - face.grid.low_m) / face.grid.cell_m + 0.5).astype(int)
+                for side in (-1, 1)
             )
             core = face.standing[max(low[0], 0) : max(high[0], 0), max(low[1], 0) : max(high[1], 0)]
             full += core.size > 0 and float(core.mean()) > FULL
         what = "column" if axis == 0 else "row"
-        yield Check("tubes_beside", full, 1, full <= 1, detail=f"a {what} more at {side}")
+        yield Check("tubes_beside", full, 1, full <= 1, detail=f"a {what} more at {where}")
 
 
 def _tops(tops: TopsInSlots, rack: RackModel, config: RackConfig) -> Iterator[Check]:

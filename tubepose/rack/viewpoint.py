@@ -10,7 +10,7 @@ from tubepose.checks import Check
 from tubepose.labware import RackModel
 from tubepose.preprocessing import thin
 from tubepose.rack.field import top_field
-from tubepose.transforms import FloatArray, invert_transform, transform_points
+from tubepose.transforms import FloatArray, invert_transform, transform_points, translation
 
 # Beyond this angle off its normal a face is foreshortened to a third: its openings close, and no sensor of this kind
 # sees its ribs. A robot's base stands about as high as the rack, and sees its face from the side or from below.
@@ -24,6 +24,8 @@ LEAST_BEHIND, LEAST_SOLID = 200, 0.03
 # Were the face not there, as many lines of sight would cross the solid part as its share of the area (100 %). A face
 # that stops them lets hardly one pass: ghosts and light through its material. Half tells them apart.
 MOST_THROUGH_PERCENT = 50.0
+# They are few if they are less than this share of those that end on the solid part, within so much of its height.
+LEAST_PASSED, STOPPED_M = 0.05, 2e-3
 # The table around a rack lies below its face, by the rack's height; above it, as near to that as this, the rack is seen
 # from below. Most of what lies around it has to say so.
 AROUND_M = 40e-3
@@ -64,8 +66,12 @@ def _through(local_m: FloatArray, origin_m: FloatArray, rack: RackModel) -> Iter
     solid = float(np.mean(field.table[inner, 0] < -INSIDE_M))
     if len(crossing_m) < LEAST_BEHIND or solid < LEAST_SOLID:
         return
-    through = 100 * float(np.mean(field.look_up(crossing_m)[0] < -INSIDE_M)) / solid
-    yield Check("seen_through", through, MOST_THROUGH_PERCENT, through <= MOST_THROUGH_PERCENT)
+    passed = field.look_up(crossing_m)[0] < -INSIDE_M
+    stopped = len(field.on_solid(local_m, translation([0.0, 0.0, rack.height_m]), STOPPED_M, INSIDE_M))
+    through = 100 * float(np.mean(passed)) / solid
+    # Where wells return hardly a point, light that goes astray is most of what lies behind: the face stops the rest.
+    few = bool(np.count_nonzero(passed) < LEAST_PASSED * stopped)
+    yield Check("seen_through", through, MOST_THROUGH_PERCENT, few or through <= MOST_THROUGH_PERCENT)
 
 
 def _places(rack: RackModel) -> FloatArray:
