@@ -75,7 +75,8 @@ def test_odds_by_hand():
     """A lone top exactly as defined: its density against 1 in 100 mm of height and 12 mm of radius."""
     ends, seat = 0.6 / np.sqrt(12), CONFIG.cap_height_m * 1e3
     floor = RACK.floor_tolerance_mm
-    radius = 1 / np.sqrt(2 * np.pi * (0.1**2 + ends**2 + 0.08**2))
+    each = 0.08**2 + (1e3 * CONFIG.top_radius_m) ** 2
+    radius = 1 / np.sqrt(2 * np.pi * (0.1**2 + ends**2 + each))
     heights = [
         share / np.sqrt(2 * np.pi * (spread**2 + floor**2 + seat**2)) for spread, share in ((0.3, 0.9), (1.0, 0.1))
     ]

@@ -288,6 +288,7 @@ class ProfileConfig(_Section):
         min_wall_points: Fewer points near a wall's radius say nothing.
         cap_height_m: Standard deviation of the height at which a cap sits, with the scanner's own error.
         cap_radius_m: Standard deviation of a cap's radius about its definition: moulded caps hold 0.1 mm.
+        top_radius_m: Standard deviation of one top's measured radius beside its circle's own: light at its edge.
         type_height_m: Standard deviation of what a type's height is off in a file that is not right: by a ruler.
         min_type_odds: Least log odds (nats) of a top's type against every other given one and another type: 99 to 1.
         cap_tilt_rad: Standard deviation of how crooked a cap sits, about each of two axes.
@@ -323,6 +324,7 @@ class ProfileConfig(_Section):
     torn_rim_m: float = 6.0e-4
     cap_height_m: float = Field(default=3.0e-4, gt=0)
     cap_radius_m: float = Field(default=1.0e-4, gt=0)
+    top_radius_m: float = Field(default=1.4e-4, gt=0)
     type_height_m: float = Field(default=1.0e-3, gt=0)
     min_type_odds: float = 4.6
     cap_tilt_rad: float = 0.0030

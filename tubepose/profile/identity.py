@@ -118,7 +118,8 @@ def _by_radius(wider_m: FloatArray, radii: Radii, sure: NDArray[np.bool_], confi
     cap's tolerance it is a type's common offset, which the median of its own tops tells, wrong ones among them.
     """
     ends2 = radii.ends_std_m**2
-    fit2 = float(np.median(radii.fit_std_m**2)) if len(radii.fit_std_m) else 0.0
+    each2 = radii.fit_std_m**2 + config.top_radius_m**2
+    fit2 = float(np.median(each2)) if len(each2) else 0.0
     # What is far off may be of another type, and tells nothing of this one's.
     sure = sure & (np.abs(wider_m) < TELLS * np.sqrt(ends2 + config.cap_radius_m**2 + fit2))
     count = sure.sum(axis=0)
@@ -132,9 +133,7 @@ def _by_radius(wider_m: FloatArray, radii: Radii, sure: NDArray[np.bool_], confi
     # A median of few is no better than one of them.
     mates = np.where(count > 1, np.minimum(count - 1, MOST_MATES) / fit2 if fit2 > 0 else 0.0, 0.0)
     spread2 = 1 / (1 / common2 + mates)
-    value = _gauss(
-        wider_m - spread2 * (expected / common2 + mates * middle), np.sqrt(spread2 + radii.fit_std_m[:, None] ** 2)
-    )
+    value = _gauss(wider_m - spread2 * (expected / common2 + mates * middle), np.sqrt(spread2 + each2[:, None]))
     beyond = (count > 1) & (np.abs(middle - expected) > CONTRADICTS * np.sqrt(common2 + fit2 / np.maximum(count, 1)))
     return np.where(beyond & np.isfinite(wider_m), -np.inf, value)
 
