@@ -18,7 +18,7 @@ from tubepose.transforms import FloatArray, parts
 
 # What stands out of a rack is looked for from here to there above its top.
 LOW_M, HIGH_M = 5e-3, 0.15
-POINTS_PER_SLOT = 160
+POINTS_PER_SLOT = 80
 # A top is the fullest height within this share of the distance to the next slot, and all of that height within a half;
 # it has so many points there, and this share of them.
 CORE, WINDOW = 0.3, 0.5
@@ -65,14 +65,14 @@ def tops_in_slots(points_m: FloatArray, T_camera_top: FloatArray, bow_m: FloatAr
     above = kernels.in_box(np.ascontiguousarray(points_m, float), *parts(T_camera_top), reach_m, LOW_M, HIGH_M)
     centers, pitches = rack.slot_centers_m, rack.pitches_m
     local = to_frame(thin(above, POINTS_PER_SLOT * len(centers)), T_camera_top)
-    apart = local[:, None, :2] - centers[None]
-    squares, half = (apart**2).sum(axis=2), rack.outline_m / 2
+    half = rack.outline_m / 2
     uv = centers / half
     slopes = (2 * bow_m[:2] * uv + bow_m[2] * uv[:, ::-1]) / half
     found, offsets = [], []
     for k in range(len(centers)):
-        near = np.flatnonzero(squares[:, k] < (1.5 * WINDOW * pitches[k]) ** 2)
-        offset = _middle(apart[near, k], local[near, 2], float(pitches[k]))
+        apart = local[:, :2] - centers[k]
+        near = np.flatnonzero((np.abs(apart) < 1.5 * WINDOW * pitches[k]).all(axis=1))
+        offset = _middle(apart[near], local[near, 2], float(pitches[k]))
         if offset is not None:
             found.append(k)
             offsets.append(offset[:2] + offset[2] * slopes[k])
