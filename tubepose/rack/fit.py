@@ -127,6 +127,13 @@ class RoughFit:
     bow_covariance: FloatArray = field(default_factory=lambda: UNKNOWN * np.eye(3))
 
 
+def bow_slopes(bow_m: FloatArray, places_m: FloatArray, rack: RackModel) -> FloatArray:
+    """Slopes of a bowed face (`Fit.bow_m`) along x and y at places (..., 2), frame of the top: tubes there lean so."""
+    half = rack.outline_m / 2
+    uv = places_m / half
+    return np.asarray((2 * bow_m[:2] * uv + bow_m[2] * uv[..., ::-1]) / half)
+
+
 def top_frame(T_camera_rack: FloatArray, rack: RackModel) -> FloatArray:
     """T_camera_top: the rack's frame, moved up to the top; shape (4, 4), metres."""
     return T_camera_rack @ translation([0.0, 0.0, rack.height_m])

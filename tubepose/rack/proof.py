@@ -15,7 +15,7 @@ from tubepose.rack.agreement import Agreement
 from tubepose.rack.alternatives import SIDES, edge_slots, gains, line_steps_m, own_distance_m
 from tubepose.rack.face import Face, face_grid, look_at_face
 from tubepose.rack.field import openings_field
-from tubepose.rack.fit import Fit, to_frame, top_frame
+from tubepose.rack.fit import Fit, bow_slopes, to_frame, top_frame
 from tubepose.rack.size import FaceSize, measure_size
 from tubepose.rack.tops_in_slots import LEAST_TOPS, TopsInSlots, tops_in_slots
 from tubepose.transforms import FloatArray
@@ -132,7 +132,6 @@ def _beside(face: Face, bow_m: FloatArray, rack: RackModel) -> Iterator[Check]:
 
     Those of a bowed rack stand along its face's normal, and lean over the places beside it.
     """
-    half = rack.outline_m / 2
     steps = line_steps_m(rack)
     for where, sign in SIDES.items():
         axis = 0 if sign[0] else 1
@@ -142,8 +141,7 @@ def _beside(face: Face, bow_m: FloatArray, rack: RackModel) -> Iterator[Check]:
         full = 0
         for slot in edge_slots(rack.all_slots, np.array(sign) * step):
             place = slot.center_m + np.array(sign) * step
-            uv = place / half
-            place = place - OVER_M * (2 * bow_m[:2] * uv + bow_m[2] * uv[::-1]) / half
+            place = place - OVER_M * bow_slopes(bow_m, place, rack)
             low, high = (
                 np.floor((place + side * CORE * step - face.grid.low_m) / face.grid.cell_m + 0.5).astype(int)
                 for side in (-1, 1)

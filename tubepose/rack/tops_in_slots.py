@@ -13,7 +13,7 @@ import numpy as np
 from tubepose.labware import RackModel
 from tubepose.preprocessing import thin
 from tubepose.rack import kernels as kernels
-from tubepose.rack.fit import to_frame
+from tubepose.rack.fit import bow_slopes, to_frame
 from tubepose.transforms import FloatArray, parts
 
 # What stands out of a rack is looked for from here to there above its top.
@@ -65,9 +65,7 @@ def tops_in_slots(points_m: FloatArray, T_camera_top: FloatArray, bow_m: FloatAr
     above = kernels.in_box(np.ascontiguousarray(points_m, float), *parts(T_camera_top), reach_m, LOW_M, HIGH_M)
     centers, pitches = rack.slot_centers_m, rack.pitches_m
     local = to_frame(thin(above, POINTS_PER_SLOT * len(centers)), T_camera_top)
-    half = rack.outline_m / 2
-    uv = centers / half
-    slopes = (2 * bow_m[:2] * uv + bow_m[2] * uv[:, ::-1]) / half
+    slopes = bow_slopes(bow_m, centers, rack)
     found, offsets = [], []
     for k in range(len(centers)):
         apart = local[:, :2] - centers[k]
