@@ -187,7 +187,8 @@ def _right_words(right: Sequence[Row]) -> str:
     return (
         f"With the right file: {count('racks')} of {len(right)} racks accepted; {count('kept')} of "
         f"{count('n_tubes_true')} tubes kept, {count('n_tubes_true', accepted)} of them in accepted racks; "
-        f"{count('ambiguous')} racks ambiguous, {count('needless')} of them though the scene is not."
+        f"{count('ambiguous')} racks ambiguous, {count('needless')} of them though the scene is not; of "
+        f"{count('scale_marks')} the cloud's scale is marked as off or unknown."
     )
 
 

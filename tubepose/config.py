@@ -119,6 +119,10 @@ class RackConfig(_Section):
         max_scale: Largest difference of scale, as a share, of everything that is seen of the rack.
         max_scale_shift_mm: A difference of scale that moves the rack by more along the line of sight is marked, beyond
             two standard deviations.
+        scale_std: Standard deviation of the cloud's scale before the capture tells more, as a share. Default: stereo
+            cameras drift by 0.5 % in hours. State what your sensor's calibration keeps; scanners reach 0.0005.
+        max_scale_unknown_mm: What three standard deviations of the scale, by the capture and that, may move a rack
+            along the line of sight before it is marked: the distance that makes a pose wrong.
         edge_std_mm: How far a sensor's blur and a projector's shadow move the edge of an outline.
         max_tops_off: How far the tops of what stands in the slots may lie from the slots' centres, median, as a share
             of the distance of slots: tubes lean by a tenth, and tops anywhere give 0.4.
@@ -162,6 +166,8 @@ class RackConfig(_Section):
     max_outline_mm: float = 6.0
     max_scale: float = 0.0075
     max_scale_shift_mm: float = 1.2
+    scale_std: float = Field(default=0.005, gt=0)
+    max_scale_unknown_mm: float = Field(default=2.0, gt=0)
     edge_std_mm: float = 0.3
     max_tops_off: float = 0.25
     max_bow_mm: float = 4.0

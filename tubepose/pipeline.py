@@ -107,7 +107,8 @@ def prepare_scene(
     looks: tuple[SlotLook, ...] = ()
     if rack_pose.T_camera_rack is not None:
         with clock.stage("slots"):
-            looks = look_at_slots(frame, intrinsics, rack_pose.T_camera_rack, rack, tubes)
+            T, bow_m = rack_pose.T_camera_rack, rack_pose.bow_m
+            looks = look_at_slots(frame, intrinsics, T, rack, tubes, noise.depth_std_m, bow_m)
     return Scene(frame, rack, tuple(tubes), intrinsics, detections, rack_pose, noise, targets, clock.shared(), looks)
 
 
