@@ -151,6 +151,10 @@ SENTENCES = {
         "the top is {value:+.1f} mm off the height of {name} in {detail}, at most {limit:.1f} mm expected: another "
         "type, or it stands on something"
     ),
+    "something_higher": (
+        "{value:.0f}% of the points over its top lie above it, at most {limit:.0f}% expected: something taller stands "
+        "there"
+    ),
     "not_in_slot": "stands or leans as slot {detail} does not let it: jammed, on something, or not in the slot",
     "tilt_uncertain": (
         "its tilt is known to {value:.2f} deg only (standard deviation), at most {limit:.2f} deg expected"
