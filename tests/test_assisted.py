@@ -10,11 +10,11 @@ from test_pipeline import CONFIG, PLACED, RACK, T_CAMERA_RACK, TUBES, frame_of, 
 
 from tubepose import pipeline
 from tubepose.capture.frame import RgbdFrame
-from tubepose.detection import Detection, points_in_box, rows_in_box
+from tubepose.detection import Detection, Detector, best_rack, points_in_box, rows_in_box
 from tubepose.detection.assisted import AssistedDetector
 from tubepose.detection.geometric import GeometricDetector
 from tubepose.detection.model import CAPPED_CLASS, OPEN_CLASS
-from tubepose.pipeline import best_rack, prepare_scene
+from tubepose.pipeline import prepare_scene
 from tubepose.rack import RackPose, RackStatus
 from tubepose.records import rack_row
 from tubepose.slots import identify_tube
@@ -25,7 +25,7 @@ CORNER = (0.0, 0.0, 20.0, 20.0)
 
 
 @dataclass
-class Network:
+class Network(Detector):
     """A network that says what it is told to, and counts how often it is asked."""
 
     found: tuple[Detection, ...]

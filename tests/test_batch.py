@@ -17,14 +17,15 @@ from tubepose.capture.hints import SlotHint
 from tubepose.capture.session import Session, load_session
 from tubepose.checks import Check
 from tubepose.config import Config
-from tubepose.detection import Detection
+from tubepose.detection import Detection, Detector
 from tubepose.detection.geometric import GeometricDetector
 from tubepose.errors import CaptureError, DetectorError
 from tubepose.labware import load_rack, load_tube
-from tubepose.pipeline import Scene, prepare_scene
+from tubepose.pipeline import prepare_scene
 from tubepose.rack import RackPose, RackStatus
 from tubepose.records import ESTIMATE_COLUMNS, RACK_COLUMNS, SENSOR_COLUMNS, SLOT_COLUMNS, TIMING_COLUMNS, to_table
 from tubepose.result_tables import Tables
+from tubepose.scene import Scene
 from tubepose.transforms import HALF_TURN, transform_points
 
 CONFIG = Config()
@@ -80,7 +81,7 @@ def test_a_bad_capture_stops_neither_the_ones_before_nor_the_ones_after() -> Non
 
 
 def test_a_detector_that_cannot_work_is_a_problem_of_its_capture() -> None:
-    class Blind:
+    class Blind(Detector):
         name = "blind"
 
         def detect(self, frame: RgbdFrame) -> Any:

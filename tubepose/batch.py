@@ -21,13 +21,15 @@ from tubepose.detection import Detector
 from tubepose.errors import CaptureError, TubePoseError, is_interrupt, kept
 from tubepose.labware import RackModel, TubeModel
 from tubepose.labware_check import compare_sizes, size_row
-from tubepose.pipeline import DEFAULT_METHOD, STOCHASTIC, Scene, StageTime, TubeEstimate, estimate_tubes, prepare_scene
+from tubepose.methods import MethodResult, foremost, seeds_of
+from tubepose.pipeline import estimate_tubes, prepare_scene
 from tubepose.rack import RackPose, RackStatus
 from tubepose.rack.turns import EarlierTurns
 from tubepose.records import Row, check_rows, estimate_row, rack_pose_row, rack_row, sensor_row, slot_rows, timing_row
 from tubepose.result_tables import Tables
+from tubepose.scene import Scene, TubeEstimate
+from tubepose.stage_times import StageTime
 from tubepose.transforms import FloatArray
-from tubepose.tubes_pitch import refuse_by_tops
 
 DetectorFactory = Callable[[RackModel, tuple[TubeModel, ...]], Detector]
 RackFinder = Callable[[RgbdFrame], RackPose]
@@ -144,7 +146,7 @@ def run_jobs(
 
     Args:
         jobs: What to run, in the order in which hints say `previous`.
-        methods: Names in `pipeline.METHODS`.
+        methods: Names in `methods.METHODS`.
         detector_for: Makes the source of boxes for a rack and the tubes that can stand in it.
         config: All sections.
         seeds: Seeds of a stochastic method: 0, 1, ... (a deterministic method runs once).
@@ -276,29 +278,25 @@ def _run_frame(
     keys = _keys(job, frame)
     tables.sensor.append(sensor_row(keys, frame, scene.noise))
     times = ([load] if load is not None else []) + list(scene.times)
-    shown_method = DEFAULT_METHOD if DEFAULT_METHOD in methods else methods[0]
-    shown: tuple[TubeEstimate, ...] = ()
-    shown_scene = scene
+    first: dict[str, MethodResult] = {}
     for method in methods:
-        for seed in range(seeds) if method in STOCHASTIC else (None,):
-            estimates, tube_times = estimate_tubes(scene, method, config, seed)
-            times += tube_times
-            judged = scene
-            if method == DEFAULT_METHOD:
-                judged, estimates = refuse_by_tops(scene, estimates, config)
-            tables.estimates += [estimate_row(keys, judged, estimate) for estimate in estimates]
-            if method == shown_method and seed in (None, 0):
-                shown, shown_scene = estimates, judged
-            if seed in (None, 0):
-                tables.racks.append({**keys, "method": method, **rack_row(judged), "named_by_nats": job.named_by_nats})
-                tables.slots += slot_rows(keys, method, judged, estimates)
-                tables.checks += check_rows(keys, method, judged, estimates)
-    of_profile = shown if shown_method == DEFAULT_METHOD else ()
-    tables.labware_check += [{**keys, **size_row(size)} for size in compare_sizes(shown_scene, of_profile, config)]
+        for seed in seeds_of(method, seeds):
+            result = estimate_tubes(scene, method, config, seed)
+            times += result.times
+            tables.estimates += [estimate_row(keys, result.scene, estimate) for estimate in result.estimates]
+            first.setdefault(method, result)
+    for method, result in first.items():
+        judged, estimates = result.scene, result.estimates
+        tables.racks.append({**keys, "method": method, **rack_row(judged), "named_by_nats": job.named_by_nats})
+        tables.slots += slot_rows(keys, method, judged, estimates)
+        tables.checks += check_rows(keys, method, judged, estimates)
+    shown = first[foremost(methods)]
+    sizes = compare_sizes(shown.scene, shown.estimates, config)
+    tables.labware_check += [{**keys, **size_row(size)} for size in sizes]
     timings = tables.timings if warm_timings is None else warm_timings
     timings += [timing_row(keys, entry, warm_timings is not None) for entry in times]
     if on_scene is not None:
-        on_scene(job, shown_scene, shown)
+        on_scene(job, shown.scene, shown.estimates)
     if scene.rack_pose.status is RackStatus.UNIT and warm_timings is None:
         raise CaptureError(scene.rack_pose.reason)
     return scene.rack_pose

@@ -41,14 +41,14 @@ def _target(
 ) -> TubeTarget:
     points_m = entry.points_m
     if entry.slot is None:
-        return TubeTarget(index, None, None, entry.share, entry.why, points_m)
+        return TubeTarget(index, None, None, entry.hull_share, entry.why, points_m)
     if not tubes:
-        return TubeTarget(index, entry.slot, None, entry.share, said("no_types_given", ""), points_m)
+        return TubeTarget(index, entry.slot, None, entry.hull_share, said("no_types_given", ""), points_m)
     slot = rack.slot(entry.slot)
     tube, why = identify_tube(class_name, points_m, tubes, rack, config.slots)
     if tube is not None:
         points_m = crop_to_slot(points_m, slot, tube, rack, config.slots)
-    return TubeTarget(index, entry.slot, tube, entry.share, why, points_m)
+    return TubeTarget(index, entry.slot, tube, entry.hull_share, why, points_m)
 
 
 def boxes_alone(scene: Scene, found: Sequence[ProfileTube], config: Config) -> list[TubeTarget]:
@@ -67,7 +67,7 @@ def boxes_alone(scene: Scene, found: Sequence[ProfileTube], config: Config) -> l
     taken = {tube.slot for tube in found}
     none = "none of the given types was found in the slot" if scene.tubes else "no tube model is given (--tubes)"
     return [
-        TubeTarget(k, entry.slot, None, entry.share, said("tube_in_box_only", none), entry.points_m)
+        TubeTarget(k, entry.slot, None, entry.hull_share, said("tube_in_box_only", none), entry.points_m)
         for k, entry in zip(
             rest, _assigned(scene.frame, scene.rack, scene.detections, rest, T_camera_rack, config), strict=True
         )

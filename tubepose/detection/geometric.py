@@ -11,7 +11,7 @@ from scipy.spatial import cKDTree
 
 from tubepose.capture.frame import RgbdFrame
 from tubepose.config import Config
-from tubepose.detection.model import TUBE_CLASS, Detection
+from tubepose.detection.model import TUBE_CLASS, Detection, Detector
 from tubepose.labware import RackModel, TubeModel
 from tubepose.labware.tubes import RACK_CLASS
 from tubepose.preprocessing import TALLEST_TUBE_M, find_rack_top
@@ -28,7 +28,7 @@ MARGIN_M, AROUND_M = 5e-3, 40e-3
 
 
 @dataclass(frozen=True)
-class GeometricDetector:
+class GeometricDetector(Detector):
     """Detector that knows the rack's definition and sees only the cloud.
 
     Attributes:
