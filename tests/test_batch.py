@@ -118,7 +118,7 @@ def test_why_and_which_marks_stand_in_every_table(monkeypatch: pytest.MonkeyPatc
         checks = (*scene.rack_pose.checks, Check("scale", 1.0, 0.5, False, decides=False))
         return replace(scene, rack_pose=replace(scene.rack_pose, checks=checks))
 
-    monkeypatch.setattr("tubepose.batch.prepare_scene", marked)
+    monkeypatch.setattr("tubepose.batch.running.prepare_scene", marked)
     tables = run(job("good", GOOD), job("bad", make_frame("bad", scale=0.5)), methods=("profile", "paper"))
     good, bad = ([row for row in tables.racks if row["capture"] == name] for name in ("good", "bad"))
     assert {(row["reason_code"], "scale" in row["marks"].split(";")) for row in good} == {("", True)}

@@ -14,11 +14,12 @@ from tubepose.config import Config
 from tubepose.detection.model import TUBE_CLASS, Detection, Detector
 from tubepose.labware import RackModel, TubeModel
 from tubepose.labware.tubes import RACK_CLASS
-from tubepose.preprocessing import TALLEST_TUBE_M, find_rack_top
+from tubepose.preprocessing import TALLEST_TUBE_M
 from tubepose.rack.edges import best_registration, coarse_sample
 from tubepose.rack.fit import top_frame
 from tubepose.rack.pose import MIN_POINTS
 from tubepose.rack.search import levels
+from tubepose.rack_band import find_rack_top
 from tubepose.transforms import FloatArray, invert_transform, transform_points
 
 CELL_M = 5e-4

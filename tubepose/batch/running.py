@@ -9,124 +9,51 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
-from pathlib import Path
 
+from tubepose.batch.jobs import MOST_ASKED, DetectorFactory, Job, UnnamedJob
 from tubepose.capture.frame import RgbdFrame
-from tubepose.capture.hints import SlotHint, TurnHint
-from tubepose.capture.session import Session, Trial
-from tubepose.capture.source import Capture, open_captures
+from tubepose.capture.hints import TurnHint
+from tubepose.capture.source import Capture
 from tubepose.compiled import compilations
 from tubepose.config import Config
-from tubepose.detection import Detector
 from tubepose.errors import CaptureError, TubePoseError, is_interrupt, kept
-from tubepose.labware import RackModel, TubeModel
+from tubepose.labware import TubeModel
 from tubepose.labware_check import compare_sizes, size_row
 from tubepose.methods import MethodResult, foremost, seeds_of
 from tubepose.pipeline import estimate_tubes, prepare_scene
-from tubepose.rack import RackPose, RackStatus
+from tubepose.rack import RackStatus
 from tubepose.rack.turns import EarlierTurns
 from tubepose.records import Row, check_rows, estimate_row, rack_pose_row, rack_row, sensor_row, slot_rows, timing_row
 from tubepose.result_tables import Tables
 from tubepose.scene import Scene, TubeEstimate
 from tubepose.stage_times import StageTime
-from tubepose.transforms import FloatArray
-
-DetectorFactory = Callable[[RackModel, tuple[TubeModel, ...]], Detector]
-RackFinder = Callable[[RgbdFrame], RackPose]
-"""Finds out which rack stands in a frame: `RackPose.rack`, or the reason why none can be named."""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Job:
-    """One capture and what is known about it.
-
-    Attributes:
-        capture: Where its frames come from.
-        rack: The rack that stands in it.
-        tubes: The kinds of tube that can stand in it.
-        hint: Which way round the rack stands, if known; with `previous`, in the first frame whose turn is known.
-        session: Name of its session, or empty.
-        trial: Name of its trial, or empty.
-        T_camera_rack: The rack's pose where it is known and not to be estimated, shape (4, 4), metres; else None.
-        named_by_nats: By how much the rack was ahead of the catalogue's next one; NaN where a person named it.
-        previous: Whether a rack that was left alone since an earlier frame of the session stands as it did there.
-    """
-
-    capture: Capture
-    rack: RackModel
-    tubes: tuple[TubeModel, ...]
-    hint: SlotHint | None = None
-    session: str = ""
-    trial: str = ""
-    T_camera_rack: FloatArray | None = None
-    named_by_nats: float = float("nan")
-    previous: bool = False
-
-
-MOST_ASKED = 5
-"""Frames that are asked for their rack: a search of a whole catalogue takes seconds."""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class UnnamedJob:
-    """One capture in which a rack stands that no one named.
-
-    Attributes:
-        capture: Where its frames come from.
-        find_rack: Asked frame by frame until it names a rack, which then is the whole capture's; `MOST_ASKED` times.
-        tubes: The kinds of tube that can stand in it.
-        hint: As `Job.hint`.
-        session: Name of its session, or empty.
-        trial: Name of its trial, or empty.
-        previous: As `Job.previous`.
-    """
-
-    capture: Capture
-    find_rack: RackFinder
-    tubes: tuple[TubeModel, ...]
-    hint: SlotHint | None = None
-    session: str = ""
-    trial: str = ""
-    previous: bool = False
-
 
 MOST_WARMED = 5
 """Frames of one kind that are run twice at most where none has a tube."""
 
 
-def session_jobs(session: Session, *, fail_fast: bool = False) -> tuple[list[Job], list[str]]:
-    """One job per trial, on the capture with the original caps; and one line per trial whose capture is not there.
+@dataclass(frozen=True, slots=True, eq=False)
+class _Question:
+    """What is asked of every frame of a run."""
 
-    Raises:
-        CaptureError: A capture is not there, and `fail_fast` is set.
-    """
-    jobs: list[Job] = []
-    problems: list[str] = []
-    for trial in session.trials:
-        with kept(None if fail_fast else problems):
-            capture = trial_capture(session, trial, trial.original)
-            tubes = session.tubes_of(trial)
-            jobs.append(
-                Job(capture, session.rack, tubes, trial.hint, session.name, trial.name, previous=trial.previous)
-            )
-    return jobs, problems
+    methods: Sequence[str]
+    detector_for: DetectorFactory
+    config: Config
+    seeds: int
 
 
-def trial_capture(session: Session, trial: Trial, relative: str) -> Capture:
-    """The one capture that a trial names; by its path in the session where others of it have the same last name.
+@dataclass(frozen=True, slots=True, eq=False)
+class _Answer:
+    """A frame's scene, and the results of all methods and seeds in the order in which they were asked."""
 
-    Raises:
-        CaptureError: It is not there, or it is a folder of several.
-    """
-    place = session.folder / relative
-    paths = {path for one in session.trials for path in (one.original, one.printed) if path is not None}
-    whole = Path(relative).with_suffix("" if place.is_file() else Path(relative).suffix).as_posix()
-    name = whole if sum(Path(path).stem == Path(relative).stem for path in paths) > 1 else None
-    topics = {f"{kind}_topic": topic for kind, topic in session.topics.model_dump().items()}
-    found = open_captures(place, name=name, unit=session.unit, **topics)
-    if len(found) != 1:
-        raise CaptureError(f"{place}: trial {trial.name} needs one capture, found {len(found)}")
-    return found[0]
+    scene: Scene
+    results: tuple[MethodResult, ...]
+    first: dict[str, MethodResult]
+
+    @property
+    def times(self) -> list[StageTime]:
+        """Times of all stages."""
+        return [*self.scene.times, *(entry for result in self.results for entry in result.times)]
 
 
 def run_jobs(
@@ -161,6 +88,7 @@ def run_jobs(
         KeyboardInterrupt: The user stopped the run, in compiled code or not; `tables` hold the jobs that were done.
     """
     tables = Tables() if tables is None else tables
+    question = _Question(methods, detector_for, config, seeds)
     warmed: dict[tuple[TubeModel, ...], int] = {}
     earlier = EarlierTurns()
 
@@ -171,17 +99,21 @@ def run_jobs(
                 hint = earlier.hint(named.session, named.rack, named.hint, config.rack)
             tries = warmed.get(named.tubes, 0)
             if warm_up and tries < MOST_WARMED:
-                warm = Tables()
-                _run_frame(named, frame, hint, methods, detector_for, config, seeds, warm, tables.timings)
+                warm = _ask(named, frame, hint, question)
+                _add_times(tables, _keys(named, frame), warm.times, warmup=True)
                 # A frame without tubes warms half of it.
-                warmed[named.tubes] = MOST_WARMED if warm.estimates else tries + 1
-            load = StageTime("load", "all", "", None, load_ms)
-            rows, compiled = len(tables.timings), compilations()
-            pose = _run_frame(named, frame, hint, methods, detector_for, config, seeds, tables, None, load, on_scene)
-            earlier.learn(named.session, named.rack, named.hint, pose)
-            if compilations() > compiled:
-                for row in tables.timings[rows:]:
-                    row["warmup"] = True
+                warmed[named.tubes] = MOST_WARMED if any(one.estimates for one in warm.results) else tries + 1
+            compiled = compilations()
+            answer = _ask(named, frame, hint, question)
+            times = [StageTime("load", "all", "", None, load_ms), *answer.times]
+            _add_times(tables, _keys(named, frame), times, warmup=compilations() > compiled)
+            _add_rows(tables, named, answer, question)
+            if on_scene is not None:
+                shown = answer.first[foremost(methods)]
+                on_scene(named, shown.scene, shown.estimates)
+            if answer.scene.rack_pose.status is RackStatus.UNIT:
+                raise CaptureError(answer.scene.rack_pose.reason)
+            earlier.learn(named.session, named.rack, named.hint, answer.scene.rack_pose)
 
     for job in jobs:
         before = tables.lengths()
@@ -257,46 +189,38 @@ def _timed_frames(capture: Capture) -> Iterator[tuple[RgbdFrame, float]]:
         yield frame, (time.perf_counter_ns() - start) / 1e6
 
 
-def _run_frame(
-    job: Job,
-    frame: RgbdFrame,
-    hint: TurnHint | None,
-    methods: Sequence[str],
-    detector_for: DetectorFactory,
-    config: Config,
-    seeds: int,
-    tables: Tables,
-    warm_timings: list[Row] | None,
-    load: StageTime | None = None,
-    on_scene: Callable[[Job, Scene, tuple[TubeEstimate, ...]], None] | None = None,
-) -> RackPose:
-    """Add a frame's rows to the tables; what is known of its rack."""
-    detector = detector_for(job.rack, job.tubes)
+def _ask(job: Job, frame: RgbdFrame, hint: TurnHint | None, question: _Question) -> _Answer:
+    """All methods and seeds for one frame."""
+    config, methods = question.config, question.methods
+    detector = question.detector_for(job.rack, job.tubes)
     scene = prepare_scene(frame, job.rack, job.tubes, detector, config, hint, job.T_camera_rack, methods)
-    tables.labware[job.rack.name] = job.rack
-    tables.labware |= {tube.name: tube for tube in job.tubes}
-    keys = _keys(job, frame)
-    tables.sensor.append(sensor_row(keys, frame, scene.noise))
-    times = ([load] if load is not None else []) + list(scene.times)
+    results: list[MethodResult] = []
     first: dict[str, MethodResult] = {}
     for method in methods:
-        for seed in seeds_of(method, seeds):
-            result = estimate_tubes(scene, method, config, seed)
-            times += result.times
-            tables.estimates += [estimate_row(keys, result.scene, estimate) for estimate in result.estimates]
-            first.setdefault(method, result)
-    for method, result in first.items():
+        for seed in seeds_of(method, question.seeds):
+            results.append(estimate_tubes(scene, method, config, seed))
+            first.setdefault(method, results[-1])
+    return _Answer(scene, tuple(results), first)
+
+
+def _add_times(tables: Tables, keys: Row, times: Sequence[StageTime], *, warmup: bool) -> None:
+    tables.timings += [timing_row(keys, entry, warmup) for entry in times]
+
+
+def _add_rows(tables: Tables, job: Job, answer: _Answer, question: _Question) -> None:
+    """A frame's rows in all tables but the timings; racks and slots of a method are those of its first seed."""
+    scene, frame = answer.scene, answer.scene.frame
+    keys = _keys(job, frame)
+    tables.labware[job.rack.name] = job.rack
+    tables.labware |= {tube.name: tube for tube in job.tubes}
+    tables.sensor.append(sensor_row(keys, frame, scene.noise))
+    for result in answer.results:
+        tables.estimates += [estimate_row(keys, result.scene, estimate) for estimate in result.estimates]
+    for method, result in answer.first.items():
         judged, estimates = result.scene, result.estimates
         tables.racks.append({**keys, "method": method, **rack_row(judged), "named_by_nats": job.named_by_nats})
         tables.slots += slot_rows(keys, method, judged, estimates)
         tables.checks += check_rows(keys, method, judged, estimates)
-    shown = first[foremost(methods)]
-    sizes = compare_sizes(shown.scene, shown.estimates, config)
+    shown = answer.first[foremost(question.methods)]
+    sizes = compare_sizes(shown.scene, shown.estimates, question.config)
     tables.labware_check += [{**keys, **size_row(size)} for size in sizes]
-    timings = tables.timings if warm_timings is None else warm_timings
-    timings += [timing_row(keys, entry, warm_timings is not None) for entry in times]
-    if on_scene is not None:
-        on_scene(job, shown.scene, shown.estimates)
-    if scene.rack_pose.status is RackStatus.UNIT and warm_timings is None:
-        raise CaptureError(scene.rack_pose.reason)
-    return scene.rack_pose
