@@ -1,4 +1,4 @@
-"""The rack's top as a level band of points, before any registration: method `obb-icp` and detector `geometric` use it."""
+"""The rack's top as a level band of points, before any registration: for `obb-icp` and the detector `geometric`."""
 
 from __future__ import annotations
 
