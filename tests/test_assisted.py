@@ -152,6 +152,22 @@ def test_a_sure_box_that_holds_hardly_anything_of_its_tube_gets_the_tubes_points
     assert np.array_equal(found.point_rows, tube.point_rows)
 
 
+def test_a_second_opinion_is_asked_for_once(frame):
+    detector = assisted(rack_box(0.9, CORNER))
+    found = detector.detect(frame)
+    others = detector.second_opinion(frame, found, "no rack there")
+    assert {box.source for box in others} == {"geometric"}
+    assert {box.note for box in others} == {"no rack in the network's box (no rack there)"}
+    assert detector.second_opinion(frame, others, "still none") == ()
+
+
+def test_a_detector_with_one_source_of_boxes_offers_nothing_else(frame):
+    found = (rack_box(0.9),)
+    for detector in (Network(found), GeometricDetector(RACK, TUBES, CONFIG)):
+        assert detector.second_opinion(frame, found, "no rack there") == ()
+        assert detector.checked(frame, T_CAMERA_RACK, found) is found
+
+
 def test_where_the_cloud_does_not_help_either_the_first_answer_stays(frame):
     cloud = frame.cloud_m.copy()
     cloud[100:] = np.nan  # what is left is no rack

@@ -10,8 +10,7 @@ import pandas as pd
 import pytest
 import scenes
 
-from tubepose import batch
-from tubepose.batch import MOST_ASKED, Job, UnnamedJob, run_jobs, session_jobs, trial_capture
+from tubepose.batch import MOST_ASKED, Job, UnnamedJob, run_jobs, running, session_jobs, trial_capture
 from tubepose.capture.frame import RgbdFrame
 from tubepose.capture.hints import SlotHint
 from tubepose.capture.session import Session, load_session
@@ -175,7 +174,7 @@ def test_every_set_of_types_is_warmed_up() -> None:
 
 def test_times_of_a_frame_in_which_code_is_compiled_are_marked(monkeypatch: pytest.MonkeyPatch) -> None:
     counts = iter([0, 0, 0, 3])  # before and after each of two frames
-    monkeypatch.setattr(batch, "compilations", lambda: next(counts))
+    monkeypatch.setattr(running, "compilations", lambda: next(counts))
     tables = run(job("good", GOOD), job("late", GOOD), warm_up=True)
     tubes = [row["warmup"] for row in tables.timings if row["stage"] == "tube"]
     assert tubes == [True, False, True]

@@ -18,7 +18,7 @@ from tubepose.labware import load_rack, load_tube
 from tubepose.methods import METHODS
 from tubepose.pipeline import estimate_tubes, prepare_scene
 from tubepose.rack import RackStatus
-from tubepose.records import slot_rows
+from tubepose.records import FIT_COLUMNS, estimate_row, slot_rows
 from tubepose.simulation.camera import default_camera
 from tubepose.targets import allowed_types
 from tubepose.transforms import make_transform, tilt_rad, transform_points
@@ -103,6 +103,24 @@ def test_every_method_answers_for_every_target_once(scene, method):
     assert [time.instance for time in times] == [target.slot for target in scene.targets]
     assert all((time.stage, time.method, time.seed) == ("tube", method, seed) for time in times)
     assert all(time.duration_ms > 0 for time in times)
+
+
+@pytest.mark.parametrize(
+    ("method", "columns"),
+    [
+        ("paper", {"excess_rms_m", "inside_share"}),
+        ("slot-icp", {"inlier_rmse_m", "fitness"}),
+        ("upright", set()),
+        ("profile", {"top_rms_m", "top_seen_share"}),
+    ],
+)
+def test_each_way_of_fitting_has_columns_of_its_own(scene, seen, method, columns):
+    asked = seen if method == "profile" else scene
+    estimates = [e for e in estimate_tubes(asked, method, CONFIG).estimates if not e.target.tube.is_open]
+    assert estimates
+    for estimate in estimates:
+        row = estimate_row({}, asked, estimate)
+        assert {name for name in FIT_COLUMNS if np.isfinite(row[name])} == columns
 
 
 def test_the_shared_stages_are_timed_in_the_papers_order(scene):
