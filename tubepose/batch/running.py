@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 
 from tubepose.batch.jobs import MOST_ASKED, DetectorFactory, Job, UnnamedJob
@@ -30,16 +30,6 @@ from tubepose.stage_times import StageTime
 
 MOST_WARMED = 5
 """Frames of one kind that are run twice at most where none has a tube."""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Question:
-    """What is asked of every frame of a run."""
-
-    methods: Sequence[str]
-    detector_for: DetectorFactory
-    config: Config
-    seeds: int
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -88,38 +78,12 @@ def run_jobs(
         KeyboardInterrupt: The user stopped the run, in compiled code or not; `tables` hold the jobs that were done.
     """
     tables = Tables() if tables is None else tables
-    question = _Question(methods, detector_for, config, seeds)
-    warmed: dict[tuple[TubeModel, ...], int] = {}
-    earlier = EarlierTurns()
-
-    def run(job: Job | UnnamedJob) -> None:
-        for named, frame, load_ms in _named_frames(job, methods, tables):
-            hint: TurnHint | None = named.hint
-            if named.previous:
-                hint = earlier.hint(named.session, named.rack, named.hint, config.rack)
-            tries = warmed.get(named.tubes, 0)
-            if warm_up and tries < MOST_WARMED:
-                warm = _ask(named, frame, hint, question)
-                _add_times(tables, _keys(named, frame), warm.times, warmup=True)
-                # A frame without tubes warms half of it.
-                warmed[named.tubes] = MOST_WARMED if any(one.estimates for one in warm.results) else tries + 1
-            compiled = compilations()
-            answer = _ask(named, frame, hint, question)
-            times = [StageTime("load", "all", "", None, load_ms), *answer.times]
-            _add_times(tables, _keys(named, frame), times, warmup=compilations() > compiled)
-            _add_rows(tables, named, answer, question)
-            if on_scene is not None:
-                shown = answer.first[foremost(methods)]
-                on_scene(named, shown.scene, shown.estimates)
-            if answer.scene.rack_pose.status is RackStatus.UNIT:
-                raise CaptureError(answer.scene.rack_pose.reason)
-            earlier.learn(named.session, named.rack, named.hint, answer.scene.rack_pose)
-
+    run = _Run(methods, detector_for, config, seeds, warm_up, on_scene, tables)
     for job in jobs:
         before = tables.lengths()
         try:
             with kept(None if fail_fast else tables.problems, partial(_one_line, job)):
-                run(job)
+                run.job(job)
         except (KeyboardInterrupt, SystemError) as problem:
             tables.cut(before)
             if not is_interrupt(problem):
@@ -129,6 +93,83 @@ def run_jobs(
         if on_done is not None:
             on_done()
     return tables
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Run:
+    """What is asked of every frame, where its rows go, and what is remembered from frame to frame."""
+
+    methods: Sequence[str]
+    detector_for: DetectorFactory
+    config: Config
+    seeds: int
+    warm_up: bool
+    on_scene: Callable[[Job, Scene, tuple[TubeEstimate, ...]], None] | None
+    tables: Tables
+    warmed: dict[tuple[TubeModel, ...], int] = field(default_factory=dict)
+    earlier: EarlierTurns = field(default_factory=EarlierTurns)
+
+    def job(self, job: Job | UnnamedJob) -> None:
+        """Add the rows of a capture."""
+        for named, frame, load_ms in _named_frames(job, self.methods, self.tables):
+            hint: TurnHint | None = named.hint
+            if named.previous:
+                hint = self.earlier.hint(named.session, named.rack, named.hint, self.config.rack)
+            if self.warm_up:
+                self._warm(named, frame, hint)
+            compiled = compilations()
+            answer = self._ask(named, frame, hint)
+            times = [StageTime("load", "all", "", None, load_ms), *answer.times]
+            self._add_times(named, frame, times, warmup=compilations() > compiled)
+            self._add_rows(named, answer)
+            if answer.scene.rack_pose.status is RackStatus.UNIT:
+                raise CaptureError(answer.scene.rack_pose.reason)
+            self.earlier.learn(named.session, named.rack, named.hint, answer.scene.rack_pose)
+
+    def _warm(self, job: Job, frame: RgbdFrame, hint: TurnHint | None) -> None:
+        """Ask once more before it counts, for the first frame with tubes of every set of types."""
+        tries = self.warmed.get(job.tubes, 0)
+        if tries == MOST_WARMED:
+            return
+        answer = self._ask(job, frame, hint)
+        self._add_times(job, frame, answer.times, warmup=True)
+        # A frame without tubes warms half of it.
+        self.warmed[job.tubes] = MOST_WARMED if any(one.estimates for one in answer.results) else tries + 1
+
+    def _ask(self, job: Job, frame: RgbdFrame, hint: TurnHint | None) -> _Answer:
+        """All methods and seeds for one frame."""
+        detector = self.detector_for(job.rack, job.tubes)
+        scene = prepare_scene(frame, job.rack, job.tubes, detector, self.config, hint, job.T_camera_rack, self.methods)
+        results: list[MethodResult] = []
+        first: dict[str, MethodResult] = {}
+        for method in self.methods:
+            for seed in seeds_of(method, self.seeds):
+                results.append(estimate_tubes(scene, method, self.config, seed))
+                first.setdefault(method, results[-1])
+        return _Answer(scene, tuple(results), first)
+
+    def _add_times(self, job: Job, frame: RgbdFrame, times: Sequence[StageTime], *, warmup: bool) -> None:
+        self.tables.timings += [timing_row(_keys(job, frame), entry, warmup) for entry in times]
+
+    def _add_rows(self, job: Job, answer: _Answer) -> None:
+        """Rows of all tables but the timings; racks and slots of a method are those of its first seed."""
+        tables, frame = self.tables, answer.scene.frame
+        keys = _keys(job, frame)
+        tables.labware[job.rack.name] = job.rack
+        tables.labware |= {tube.name: tube for tube in job.tubes}
+        tables.sensor.append(sensor_row(keys, frame, answer.scene.noise))
+        for result in answer.results:
+            tables.estimates += [estimate_row(keys, result.scene, estimate) for estimate in result.estimates]
+        for method, result in answer.first.items():
+            judged, estimates = result.scene, result.estimates
+            tables.racks.append({**keys, "method": method, **rack_row(judged), "named_by_nats": job.named_by_nats})
+            tables.slots += slot_rows(keys, method, judged, estimates)
+            tables.checks += check_rows(keys, method, judged, estimates)
+        shown = answer.first[foremost(self.methods)]
+        sizes = compare_sizes(shown.scene, shown.estimates, self.config)
+        tables.labware_check += [{**keys, **size_row(size)} for size in sizes]
+        if self.on_scene is not None:
+            self.on_scene(job, shown.scene, shown.estimates)
 
 
 def _one_line(job: Job | UnnamedJob, problem: TubePoseError) -> str:
@@ -187,40 +228,3 @@ def _timed_frames(capture: Capture) -> Iterator[tuple[RgbdFrame, float]]:
         if frame is None:
             return
         yield frame, (time.perf_counter_ns() - start) / 1e6
-
-
-def _ask(job: Job, frame: RgbdFrame, hint: TurnHint | None, question: _Question) -> _Answer:
-    """All methods and seeds for one frame."""
-    config, methods = question.config, question.methods
-    detector = question.detector_for(job.rack, job.tubes)
-    scene = prepare_scene(frame, job.rack, job.tubes, detector, config, hint, job.T_camera_rack, methods)
-    results: list[MethodResult] = []
-    first: dict[str, MethodResult] = {}
-    for method in methods:
-        for seed in seeds_of(method, question.seeds):
-            results.append(estimate_tubes(scene, method, config, seed))
-            first.setdefault(method, results[-1])
-    return _Answer(scene, tuple(results), first)
-
-
-def _add_times(tables: Tables, keys: Row, times: Sequence[StageTime], *, warmup: bool) -> None:
-    tables.timings += [timing_row(keys, entry, warmup) for entry in times]
-
-
-def _add_rows(tables: Tables, job: Job, answer: _Answer, question: _Question) -> None:
-    """A frame's rows in all tables but the timings; racks and slots of a method are those of its first seed."""
-    scene, frame = answer.scene, answer.scene.frame
-    keys = _keys(job, frame)
-    tables.labware[job.rack.name] = job.rack
-    tables.labware |= {tube.name: tube for tube in job.tubes}
-    tables.sensor.append(sensor_row(keys, frame, scene.noise))
-    for result in answer.results:
-        tables.estimates += [estimate_row(keys, result.scene, estimate) for estimate in result.estimates]
-    for method, result in answer.first.items():
-        judged, estimates = result.scene, result.estimates
-        tables.racks.append({**keys, "method": method, **rack_row(judged), "named_by_nats": job.named_by_nats})
-        tables.slots += slot_rows(keys, method, judged, estimates)
-        tables.checks += check_rows(keys, method, judged, estimates)
-    shown = answer.first[foremost(question.methods)]
-    sizes = compare_sizes(shown.scene, shown.estimates, question.config)
-    tables.labware_check += [{**keys, **size_row(size)} for size in sizes]
