@@ -36,10 +36,11 @@ ALLOWED: dict[str, set[str]] = {
     "profile": {"capture", "checks", "compiled", "confidence", "config", "labware", "preprocessing", "sensor", "tube"},
     "scene": {"capture", "checks", "detection", "labware", "rack", "sensor", "slots", "stage_times", "tube"},
     "occupancy": {"scene", "slots", "tube"},
-    "targets": {"capture", "checks", "config", "detection", "labware", "profile", "scene", "slots"},
+    "targets": {"capture", "checks", "config", "detection", "labware", "scene", "slots"},
     "methods": {
         "checks",
         "config",
+        "detection",
         "labware",
         "preprocessing",
         "profile",

@@ -16,11 +16,11 @@ from tubepose.detection import Detection, Detector
 from tubepose.detection.geometric import GeometricDetector
 from tubepose.labware import load_rack, load_tube
 from tubepose.methods import METHODS
+from tubepose.methods.profile_boxes import allowed_types
 from tubepose.pipeline import estimate_tubes, prepare_scene
 from tubepose.rack import RackStatus
 from tubepose.records import FIT_COLUMNS, estimate_row, slot_rows
 from tubepose.simulation.camera import default_camera
-from tubepose.targets import allowed_types
 from tubepose.transforms import make_transform, tilt_rad, transform_points
 from tubepose.tube import TubeStatus
 

@@ -8,11 +8,11 @@ from dataclasses import dataclass, replace
 from tubepose.checks import failed
 from tubepose.config import Config
 from tubepose.methods.method import MethodResult, estimate_of, not_asked
+from tubepose.methods.profile_boxes import allowed_types, boxes_alone
 from tubepose.profile import FaceBow, ProfileTube, fit_profiles
 from tubepose.rack import RackPose
 from tubepose.scene import Scene, TubeEstimate, TubeTarget
 from tubepose.stage_times import StageTime
-from tubepose.targets import allowed_types, boxes_alone
 from tubepose.tubes_pitch import refuse_by_tops
 
 
