@@ -76,7 +76,7 @@ def test_a_height_that_all_tubes_of_a_type_share_is_the_files():
 
 
 def test_odds_by_hand():
-    """A lone top exactly as defined: its density against 1 in 100 mm of height and 12 mm of radius."""
+    """A lone top exactly as defined: its density against 12 mm of radius, and 100 mm of height or the same height."""
     ends, seat = 0.6 / np.sqrt(12), CONFIG.cap_height_m * 1e3
     floor = RACK.floor_tolerance_mm
     each = 0.08**2 + (1e3 * CONFIG.top_radius_m) ** 2
@@ -84,7 +84,7 @@ def test_odds_by_hand():
     heights = [
         share / np.sqrt(2 * np.pi * (spread**2 + floor**2 + seat**2)) for spread, share in ((0.3, 0.9), (1.0, 0.1))
     ]
-    expected = np.log(radius * sum(heights) * 100 * 12)
+    expected = np.log(radius * sum(heights) / (0.98 / 100 + 0.02 * sum(heights)) * 12)
     assert names([(LOW, 0.0, 0.0)], [LOW]).odds[0] == pytest.approx(expected, abs=1e-6)
 
 
@@ -179,3 +179,10 @@ def test_a_top_is_the_highest_thing_over_its_slot(frame):
     assert np.all(higher_share(found, tubes, RACK) < 0.02)
     lower = replace(found, level_m=found.level_m - 4e-3)
     assert np.all(higher_share(lower, tubes, RACK) > 0.9)
+
+
+def test_a_height_alone_does_not_tell_a_type():
+    """Another type of a standard length is as high: what was not measured across is not sure."""
+    radii = Radii(np.array([np.nan]), np.array([FIT_M]), 1e-4)
+    found = name_tops(np.array([top_level_m(WIDE, RACK)]), radii, np.array([[True]]), RACK, [WIDE], CONFIG)
+    assert 0 < found.odds[0] < CONFIG.min_type_odds

@@ -80,8 +80,9 @@ class GeometricDetector(Detector):
 
     def _around_rack(self, local_m: FloatArray) -> NDArray[np.bool_]:
         """Which points (N, 3), frame of the top, a registration is judged by: those of the rack and beside it."""
-        near = np.all(np.abs(local_m[:, :2]) < self.rack.outline_m / 2 + AROUND_M, axis=1)
-        return np.asarray(near & (local_m[:, 2] < TALLEST_TUBE_M))
+        beyond_m = (np.abs(local_m[:, :2]) - self.rack.outline_m / 2).max(axis=1)
+        above_base = local_m[:, 2] > -self.rack.height_m
+        return np.asarray((beyond_m < AROUND_M) & (above_base | (beyond_m > 0)) & (local_m[:, 2] < TALLEST_TUBE_M))
 
     def _standing(self, frame: RgbdFrame, rows: NDArray[np.intp], local_m: FloatArray) -> tuple[Detection, ...]:
         """Tubes among points of the rack: their rows of the frame (N,), and themselves (N, 3), frame of the top."""

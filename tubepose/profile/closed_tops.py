@@ -198,7 +198,10 @@ def top_measures(
 
 
 def higher_share(measured: Measured, tubes: Sequence[TubeModel], rack: RackModel) -> FloatArray:
-    """Share of the points over the middle of every top that lie above it, shape (T,): a top is the highest thing there.
+    """Share of the points over the middle of every top that are of a higher one, shape (T,).
+
+    A top is the highest thing over its slot. What is higher and no ghost lies at one height: the fullest two
+    millimetres count.
 
     Args:
         measured: The tops, T of them.
@@ -212,9 +215,13 @@ def higher_share(measured: Measured, tubes: Sequence[TubeModel], rack: RackModel
     of, points_m = measured.label[rows], measured.points.points_m[rows]
     radius_m = top_shapes(measured.tops, tubes, rack).radius_m
     near = np.hypot(*(points_m[:, :2] - measured.center_m[of]).T) < MIDDLE_SHARE * radius_m[of]
-    of, higher = of[near], points_m[near, 2] > measured.level_m[of[near]] + HIGHER_M
-    inside, above = np.bincount(of, minlength=count), np.bincount(of[higher], minlength=count)
-    return np.asarray(above / np.maximum(inside, MIDDLE_POINTS))
+    of = of[near]
+    bins = np.ceil((points_m[near, 2] - measured.level_m[of] - HIGHER_M) / (HIGHER_M / 2)).astype(np.intp)
+    higher, width = bins > 0, max(int(bins.max(initial=0)), 1) + 2
+    inside = np.bincount(of, minlength=count)
+    counts = np.bincount(of[higher] * width + bins[higher], minlength=count * width).reshape(count, width)
+    fullest = (counts[:, :-1] + counts[:, 1:]).max(axis=1)
+    return np.asarray(fullest / np.maximum(inside, MIDDLE_POINTS))
 
 
 def label_points(standing: Standing, center_m: FloatArray, radius_m: FloatArray) -> NDArray[np.intp]:
