@@ -33,13 +33,13 @@ from tubepose.detection.yolo import YoloDetector
 from tubepose.errors import CaptureError
 from tubepose.report import write_aside, write_text
 from tubepose.simulation import read_exact_truth
+from tubepose.simulation.looks.appearance import Light, Part, Surface
+from tubepose.simulation.looks.render import render
 from tubepose.simulation.meshes import Mesh, merge, rack_shell, rack_wells
 from tubepose.simulation.scene import MATERIALS, Finishes, PlacedTube, tube_parts
 from tubepose.simulation.truth import ExactTruth
-from tubepose.training.appearance import Light, Part, Surface
 from tubepose.training.images import CLASSES, detections
 from tubepose.training.labels import Label, label_objects
-from tubepose.training.render import render
 from tubepose.training.scenes import STANDS_OUT_M, LearningScene, SceneObject
 from tubepose.transforms import invert_transform, transform_points
 

@@ -13,6 +13,9 @@ from tubepose_cli.paths import named
 
 if TYPE_CHECKING:
     from tubepose.simulation import SceneVariation
+    from tubepose.simulation.stereo import StereoCamera
+
+RESOLUTION = 1376
 
 
 def simulate(
@@ -21,8 +24,14 @@ def simulate(
     tubes: Annotated[str, typer.Option(help="Tubes, names or files, with commas.")],
     trials: Annotated[int, typer.Option(min=1, help="Trials per kind of tube.")] = 2,
     seed: Annotated[int, typer.Option(min=0, help="The same seed gives the same bytes.")] = 0,
-    sensor: Annotated[str, typer.Option(help="Sensor model: raycast or structured-light.")] = "raycast",
-    resolution: Annotated[int, typer.Option(min=64, max=2064, help="Side of the square image, pixels.")] = 1376,
+    sensor: Annotated[str, typer.Option(help="Sensor model: raycast, structured-light or stereo.")] = "raycast",
+    camera: Annotated[
+        str | None, typer.Option(help="Camera of --sensor stereo: d405, d435, d435-640, or a YAML file.")
+    ] = None,
+    frames: Annotated[int, typer.Option(min=1, help="Frames of each capture; several make it a recording.")] = 1,
+    resolution: Annotated[
+        int | None, typer.Option(min=64, max=2064, help="Side of a scanner's square image, pixels [default: 1376].")
+    ] = None,
     cap: Annotated[str, typer.Option(help="Printed cap of the ground truth.")] = "printed-square-16.7",
     mixed: Annotated[bool, typer.Option("--mixed", help="All kinds of tube in every trial.")] = False,
     scenes: Annotated[Path | None, typer.Option(help="YAML file of what varies; see docs/simulation.md.")] = None,
@@ -39,8 +48,9 @@ def simulate(
         bool, typer.Option("--no-calibration-error", help="A camera that is calibrated exactly.")
     ] = False,
     capture_format: Annotated[
-        Literal["folder", "mcap"], typer.Option("--format", help="Kind of capture files.")
-    ] = "folder",
+        Literal["folder", "mcap"] | None,
+        typer.Option("--format", help="Kind of capture files [default: folder; mcap for several frames]."),
+    ] = None,
     threads: Annotated[int, typer.Option(min=0, help="0: one per core. They change no byte.")] = 0,
 ) -> None:
     """Make a SIMULATED session like the paper's: printed and original caps, exact truth apart."""
@@ -52,6 +62,7 @@ def simulate(
 
     if sensor not in SENSORS:
         raise ConfigError(unknown_name("sensor", sensor, SENSORS))
+    seen_by = _stereo_camera(sensor, camera, resolution)
     models = read_tubes(tubes)
     variation = _variation(scenes, fill, scattering, liquid, labels, perfect_parts)
     total = 2 * trials * (1 if mixed else len(models))
@@ -59,13 +70,31 @@ def simulate(
     try:
         with counted_progress("simulated captures") as show:
             simulate_session(
-                out, rack_model, models, trials=trials, seed=seed, cap=cap_model, sensor=sensor, resolution=resolution,
-                variation=variation, mixed=mixed, calibration_error=not no_calibration_error,
-                capture_format=capture_format, threads=threads or available_cores(), progress=show,
+                out, rack_model, models, trials=trials, seed=seed, cap=cap_model, sensor=sensor,
+                resolution=resolution or RESOLUTION, camera=seen_by, frames=frames, variation=variation, mixed=mixed,
+                calibration_error=not no_calibration_error, threads=threads or available_cores(), progress=show,
+                capture_format=capture_format or ("folder" if frames == 1 else "mcap"),
             )  # fmt: skip
     except OSError as problem:
         raise CaptureError(f"{out}: cannot be written ({problem.strerror}); choose another place") from None
     say(f"{out}: {total} simulated captures in {total // 2} trials; next: tubepose bench {out} --out RESULTS")
+
+
+def _stereo_camera(sensor: str, camera: str | None, resolution: int | None) -> StereoCamera | None:
+    """The camera of ``--sensor stereo``; options that a sensor has no use for are refused."""
+    from tubepose.errors import ConfigError
+
+    if sensor != "stereo":
+        if camera is not None:
+            raise ConfigError(f"--camera given, but --sensor {sensor} has no use for it; give --sensor stereo")
+        return None
+    from tubepose.simulation.stereo import CAMERAS, load_stereo_camera
+
+    if resolution is not None:
+        raise ConfigError("--resolution given, but the size of a stereo image is its camera's; leave it out")
+    if camera is None:
+        raise ConfigError(f"--sensor stereo needs --camera: {', '.join(CAMERAS)}, or a YAML file")
+    return load_stereo_camera(camera)
 
 
 def available_cores() -> int:

@@ -14,15 +14,15 @@ from tubepose.detection.model import CAPPED_CLASS, OPEN_CLASS, RACK_CLASS, visib
 from tubepose.detection.yolo_input import BORDER
 from tubepose.errors import DetectorError
 from tubepose.labware import load_cap, load_rack, load_tube
+from tubepose.simulation.looks.appearance import NOTHING, Lamp, Light, Part, Surface
+from tubepose.simulation.looks.exposure import expose
+from tubepose.simulation.looks.render import render
+from tubepose.simulation.looks.textures import GROUNDS, HELD_OUT_GROUNDS, SIZE
 from tubepose.simulation.meshes import box, revolve
-from tubepose.training.appearance import NOTHING, Lamp, Light, Part, Surface
 from tubepose.training.augmentation import Views, draw_sample
 from tubepose.training.images import CLASSES, ImageSet, write_images
 from tubepose.training.labels import label_objects
-from tubepose.training.render import render
 from tubepose.training.scenes import LearningScene, SceneObject, Stock, random_scene
-from tubepose.training.sensor import expose
-from tubepose.training.textures import GROUNDS, HELD_OUT_GROUNDS, SIZE
 from tubepose.training.variants import cap_outline, fits, vary_rack, vary_tube
 from tubepose.transforms import make_transform
 

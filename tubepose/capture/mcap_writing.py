@@ -18,6 +18,7 @@ from tubepose.capture.message_types import CAMERA_INFO, COMPRESSED_IMAGE, DEFINI
 from tubepose.capture.recording import METADATA_NAME
 from tubepose.capture.writing import is_depth_image
 from tubepose.errors import CaptureError
+from tubepose.transforms import FloatArray
 
 CLOUD_TOPIC = "/camera/points"
 DEPTH_TOPIC = "/camera/aligned_depth_to_color/image_raw"
@@ -30,12 +31,16 @@ _FRAME_ID = "camera_color_optical_frame"
 _POINT_BYTES = 12
 # A float32 depth is exact to this, metres; a cloud that is farther from its lines of sight is not written as depth.
 _DEPTH_TOLERANCE_M = 1.0e-6
+_MAX_COUNT = 65535
+# Depth this near to whole millimetres is whole millimetres: rounding of a float.
+_WHOLE_M = 1.0e-9
 
 
 @dataclass(frozen=True, slots=True)
 class _Compression:
     picture: PictureFormat
     depth_step_m: float
+    exact_depth: bool
 
 
 def write_mcap(
@@ -46,6 +51,7 @@ def write_mcap(
     compressed: bool = False,
     picture: PictureFormat = "jpeg",
     depth_step_m: float = DEPTH_STEP_M,
+    exact_depth: bool = False,
 ) -> None:
     """Write frames as one recording; the same frames give the same bytes.
 
@@ -57,6 +63,7 @@ def write_mcap(
         picture: Of compressed pictures: PNG keeps every pixel, JPEG of quality 95 has a third of the size.
         depth_step_m: Of compressed depth: difference of neighbouring counts at the farthest point; finer nearer.
             The depth that is read back is off by up to half of it.
+        exact_depth: Compress pictures alone; depth is written as 16UC1 where it is whole millimetres, else as 32FC1.
 
     Raises:
         CaptureError: `as_depth` for a frame without intrinsics, or with points off the lines of sight of their pixels;
@@ -66,7 +73,8 @@ def write_mcap(
     aside = path.with_name(f".{path.name}.part")
     try:
         with aside.open("wb") as stream:
-            _write(stream, path, frames, as_depth, _Compression(picture, depth_step_m) if compressed else None)
+            compression = _Compression(picture, depth_step_m, exact_depth) if compressed else None
+            _write(stream, path, frames, as_depth, compression)
         aside.replace(path)
     finally:
         aside.unlink(missing_ok=True)
@@ -104,11 +112,11 @@ def _messages(
         yield f"{IMAGE_TOPIC}/compressed", COMPRESSED_IMAGE, header | _shot(frame.image, compression.picture)
     elif frame.image is not None:
         yield IMAGE_TOPIC, IMAGE, header | _image(frame.image, "rgb8" if frame.image.ndim == 3 else "mono8")
-    if as_depth and compression is not None:
+    if as_depth and compression is not None and not compression.exact_depth:
         data = encode_compressed_depth(frame.cloud_m[..., 2], where, compression.depth_step_m)
         yield f"{DEPTH_TOPIC}/compressedDepth", COMPRESSED_IMAGE, header | {"format": FORMAT, "data": data}
     elif as_depth:
-        yield DEPTH_TOPIC, IMAGE, header | _image(frame.cloud_m[..., 2].astype("<f4"), "32FC1")
+        yield DEPTH_TOPIC, IMAGE, header | _depth(frame.cloud_m[..., 2], compression is not None)
     else:
         yield CLOUD_TOPIC, POINT_CLOUD, header | _cloud(frame)
 
@@ -117,6 +125,14 @@ def _shot(pixels: NDArray[np.uint8], kind: PictureFormat) -> dict[str, Any]:
     encoding = "rgb8" if pixels.ndim == 3 else "mono8"
     data = encode_png(pixels) if kind == "png" else encode_jpeg(pixels)
     return {"format": f"{encoding}; {kind} compressed {encoding.replace('rgb', 'bgr')}", "data": data}
+
+
+def _depth(depth_m: FloatArray, counted: bool) -> dict[str, Any]:
+    """Depth in metres, or in whole millimetres where they are that and are asked for."""
+    counts = np.rint(np.nan_to_num(depth_m) * 1e3)
+    if counted and counts.max(initial=0.0) < _MAX_COUNT and np.nanmax(np.abs(counts * 1e-3 - depth_m), initial=0.0) < _WHOLE_M:
+        return _image(counts.astype("<u2"), "16UC1")
+    return _image(depth_m.astype("<f4"), "32FC1")
 
 
 def _image(pixels: NDArray[Any], encoding: str) -> dict[str, Any]:

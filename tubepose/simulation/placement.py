@@ -30,6 +30,7 @@ _LEAN_TRIES = 200
 _SWEEPS = 2
 _LEANS = 30
 _POSE_TRIES = 500
+_USUAL_M = sum(DISTANCE_M) / 2
 
 
 def place_tubes(
@@ -200,11 +201,12 @@ def place_rack(
     intrinsics: CameraIntrinsics,
     rng: np.random.Generator,
     scanner_tilt_rad: tuple[float, float] = SCANNER_TILT_RAD,
+    distance_m: tuple[float, float] = DISTANCE_M,
 ) -> FloatArray:
     """Random T_camera_rack of shape (4, 4) with the whole rack and its tubes in view.
 
-    Any yaw; the camera's axis tilted from the rack's normal about a random axis; the rack's top 0.60 to 0.70 m away
-    and off the image's centre.
+    Any yaw; the camera's axis tilted from the rack's normal about a random axis; the rack's top at a random distance
+    and off the image's centre, at 0.65 m by up to 60 mm in x and y, elsewhere by as many pixels.
 
     Args:
         rack: The rack.
@@ -212,6 +214,7 @@ def place_rack(
         intrinsics: Of the camera that must see all of it.
         rng: Source of randomness.
         scanner_tilt_rad: Least and most angle between the camera's axis and the rack's normal.
+        distance_m: Least and most depth of the middle of the rack's top.
 
     Raises:
         LabwareError: The rack is too large for the camera's view.
@@ -220,18 +223,20 @@ def place_rack(
     corners[:, :2] *= rack.outline_m / 2
     size = np.array([intrinsics.width, intrinsics.height])
     facing = np.diag([1.0, -1.0, -1.0])
+    # Not scaled at the usual distance: its numbers stay what they were to the last digit.
+    most_m = MAX_RACK_SHIFT_M if distance_m == DISTANCE_M else MAX_RACK_SHIFT_M * sum(distance_m) / (2 * _USUAL_M)
     for _ in range(_POSE_TRIES):
         yaw, about = rng.uniform(0, 2 * np.pi, 2)
         tilt = rng.uniform(*scanner_tilt_rad)
-        shift = rng.uniform(-MAX_RACK_SHIFT_M, MAX_RACK_SHIFT_M, 2)
+        shift = rng.uniform(-most_m, most_m, 2)
         tilted = Rotation.from_rotvec(tilt * np.array([np.cos(about), np.sin(about), 0.0])).as_matrix()
         rotation = tilted @ facing @ Rotation.from_euler("z", yaw).as_matrix()
-        top_center = np.array([*shift, rng.uniform(*DISTANCE_M)])
+        top_center = np.array([*shift, rng.uniform(*distance_m)])
         T_camera_rack = make_transform(rotation, top_center - rotation @ [0.0, 0.0, rack.height_m])
         uv = intrinsics.project(transform_points(T_camera_rack, corners))
         if np.all(uv > IMAGE_MARGIN * size) and np.all(uv < (1 - IMAGE_MARGIN) * size):
             return T_camera_rack
     raise LabwareError(
         f"rack '{rack.name}' ({rack.outline_mm[0]:g} x {rack.outline_mm[1]:g} mm) does not fit into the view "
-        f"of the simulated camera at {DISTANCE_M[0]:g} to {DISTANCE_M[1]:g} m; choose a smaller rack"
+        f"of the simulated camera at {distance_m[0]:g} to {distance_m[1]:g} m; choose a smaller rack, or a distance_m in --scenes that is larger"
     )

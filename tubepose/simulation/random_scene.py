@@ -9,14 +9,15 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
+from typing import Protocol
 
 import numpy as np
 
+from tubepose.capture.frame import CameraIntrinsics
 from tubepose.labware import CapModel, RackModel, TubeModel, WallOptics
 from tubepose.simulation.bow import Bow
-from tubepose.simulation.camera import StructuredLightCamera
 from tubepose.simulation.collision import CLEARANCE_M, collide, solid_of
-from tubepose.simulation.placement import place_rack, place_tubes
+from tubepose.simulation.placement import DISTANCE_M, place_rack, place_tubes
 from tubepose.simulation.scene import CapFit, Finishes, Label, Liquid, PlacedTube, Scene
 from tubepose.simulation.variation import SceneVariation, Tolerances
 
@@ -33,13 +34,23 @@ LABEL_MARGIN_M = 2e-3
 _FIT_TRIES = 30
 
 
+class SeeingCamera(Protocol):
+    """A camera of any kind, by what it can see."""
+
+    @property
+    def intrinsics(self) -> CameraIntrinsics:
+        """Pinhole of its image."""
+        ...
+
+
 def random_scene(
     rack: RackModel,
     types: Sequence[TubeModel],
     cap: CapModel,
-    camera: StructuredLightCamera,
+    camera: SeeingCamera,
     rng: np.random.Generator,
     variation: SceneVariation = DEFAULT_VARIATION,
+    distance_m: tuple[float, float] = DISTANCE_M,
 ) -> Scene:
     """Draw a scene; the tubes wear their own caps.
 
@@ -50,6 +61,7 @@ def random_scene(
         camera: The camera that must see all of the rack.
         rng: Source of randomness. Streams are spawned from it, so a second scene from the same generator differs.
         variation: Ranges to draw from.
+        distance_m: Depth of the middle of the rack's face where `variation` does not say.
 
     Raises:
         LabwareError: A tube cannot stand in the rack, or the rack does not fit into the view.
@@ -62,7 +74,7 @@ def random_scene(
     tallest = rack.floor_m + max(max(model.height_m, cap.offset_m(model)) for model in types)
     low_deg, high_deg = variation.scanner_tilt_deg
     tilt_rad = (float(np.deg2rad(low_deg)), float(np.deg2rad(high_deg)))
-    T_camera_rack = place_rack(rack, tallest, camera.intrinsics, rng, tilt_rad)
+    T_camera_rack = place_rack(rack, tallest, camera.intrinsics, rng, tilt_rad, variation.distance_m or distance_m)
     tubes = fit_caps(tubes, cap, variation.tolerances, fit_rng)
     plastic = _drawn_plastic(variation, wall_rng)
     tubes = tuple(

@@ -18,20 +18,24 @@ from tubepose.capture.manifest import tree_sha256
 from tubepose.capture.session import SESSION_FILE
 from tubepose.errors import CaptureError, ConfigError
 from tubepose.labware import CapModel, Labware, RackModel, TubeModel, catalogue
-from tubepose.simulation.camera import StructuredLightCamera, default_camera
+from tubepose.simulation.camera import default_camera
 from tubepose.simulation.parallel import in_processes
 from tubepose.simulation.random_scene import DEFAULT_VARIATION, random_scene
 from tubepose.simulation.scene import Scene
-from tubepose.simulation.shooting import SENSORS, CaptureFormat, Shooting, Shot
+from tubepose.simulation.placement import DISTANCE_M
+from tubepose.simulation.shooting import FRAME_NS, SENSORS, Camera, CaptureFormat, Shooting, Shot, sensor_label
+from tubepose.simulation.stereo.stereo_camera import StereoCamera
 from tubepose.simulation.truth import write_exact_truth
 from tubepose.simulation.variation import SceneVariation
 
 CLICK_ERROR_PX = 3.0
-# Stamps count from a fixed moment, so that they depend on the seed and the trial alone.
+# Counted from a fixed moment, so that they depend on the seed and the trial alone.
 _FIRST_STAMP_NS = 1_700_000_000_123_456_789
 _TRIAL_NS = 60_000_000_000
 _RECAP_NS = 25_000_000_000
 _SESSION_NS = 86_400_000_000_000
+MAX_FRAMES = _RECAP_NS // FRAME_NS
+"""A recording ends before the caps are changed."""
 # Which run the captures of an interrupted one belong to.
 _RUN_FILE = ".run"
 _PACKAGE = Path(__file__).parents[1]
@@ -63,11 +67,17 @@ class _Settings:
     rack: RackModel
     tubes: tuple[TubeModel, ...]
     cap: CapModel
-    camera: StructuredLightCamera
+    camera: Camera
     sensor: str
     variation: SceneVariation
     capture_format: CaptureFormat
     seed: int
+    n_frames: int
+
+    @property
+    def label(self) -> str:
+        """The sensor as sessions and captures name it."""
+        return sensor_label(self.sensor, self.camera)
 
 
 def simulate_session(
@@ -80,6 +90,8 @@ def simulate_session(
     cap: CapModel,
     sensor: str = "raycast",
     resolution: int = 1376,
+    camera: StereoCamera | None = None,
+    frames: int = 1,
     variation: SceneVariation = DEFAULT_VARIATION,
     mixed: bool = False,
     calibration_error: bool = True,
@@ -100,7 +112,9 @@ def simulate_session(
             sensor.
         cap: The printed cap.
         sensor: Name of a simulated sensor.
-        resolution: Width and height of the square image, pixels.
+        resolution: Width and height of the square image, pixels; not of ``stereo``.
+        camera: The camera of the sensor ``stereo``, and of no other.
+        frames: Frames of each capture, all of the same unmoved scene; more than one need the format ``mcap``.
         variation: Ranges that the scenes are drawn from. At least one slot is filled.
         mixed: Any of the types in each trial.
         calibration_error: Whether the camera has one.
@@ -118,10 +132,10 @@ def simulate_session(
     """
     _check_out(out)
     _check_tubes(tubes)
-    _check_numbers(trials=(trials, 1), seed=(seed, 0), resolution=(resolution, 32), threads=(threads, 1))
-    _check_names(sensor, capture_format)
-    camera = _camera(resolution, calibration_error)
-    settings = _Settings(rack, tuple(tubes), cap, camera, sensor, variation, capture_format, seed)
+    _check_numbers(trials=(trials, 1), seed=(seed, 0), resolution=(resolution, 32), threads=(threads, 1), frames=(frames, 1))
+    _check_names(sensor, capture_format, frames)
+    seen_by = _camera(sensor, camera, resolution, calibration_error)
+    settings = _Settings(rack, tuple(tubes), cap, seen_by, sensor, variation, capture_format, seed, frames)
     drawn = [_draw(plan, settings, printed) for plan in _plans(tubes, trials, seed, mixed)]
     aside = out.with_name(f".{out.name}.part" if resume else f".{out.name}.part-{os.getpid()}")
     if not resume:
@@ -129,7 +143,7 @@ def simulate_session(
     try:
         _begin(aside, f"{settings} {[trial.entry for trial in drawn]}")
         left = [shot for trial in drawn for shot in trial.shots if not (aside / shot.place).exists()]
-        shoot = Shooting(aside, camera, sensor, capture_format)
+        shoot = Shooting(aside, seen_by, sensor, capture_format, frames)
         in_processes(shoot, left, threads, lambda done: progress(done, len(left)) if progress is not None else None)
         _finish(aside, settings, drawn)
         if out.exists():
@@ -158,19 +172,29 @@ def _check_numbers(**least_of: tuple[int, int]) -> None:
             raise ConfigError(f"{name} is {value}; expected {least} or more")
 
 
-def _check_names(sensor: str, capture_format: str) -> None:
+def _check_names(sensor: str, capture_format: str, frames: int) -> None:
     if capture_format not in get_args(CaptureFormat):
         known = ", ".join(get_args(CaptureFormat))
         raise ConfigError(f"unknown capture format '{capture_format}'; known formats: {known}")
     if sensor not in SENSORS:
         raise ConfigError(f"unknown sensor '{sensor}'; known sensors: {', '.join(SENSORS)}")
 
+    if frames > 1 and capture_format != "mcap":
+        raise ConfigError(f"{frames} frames do not go into a {capture_format}, which holds one; choose the format mcap")
+    if frames > MAX_FRAMES:
+        raise ConfigError(f"frames is {frames}; expected {MAX_FRAMES} at most")
 
-def _camera(resolution: int, calibration_error: bool) -> StructuredLightCamera:
-    camera = default_camera(resolution)
+
+def _camera(sensor: str, camera: StereoCamera | None, resolution: int, calibration_error: bool) -> Camera:
+    if (sensor == "stereo") != (camera is not None):
+        found = "none" if camera is None else camera.name
+        raise ConfigError(f"a camera goes with the sensor stereo, and with no other; found {found} with {sensor}")
+    scanner = default_camera(resolution)
     if calibration_error:
-        return camera
-    return dataclasses.replace(camera, noise=dataclasses.replace(camera.noise, calibration_error_m=0.0))
+        return camera or scanner
+    if camera is not None:
+        return camera.exact()
+    return dataclasses.replace(scanner, noise=dataclasses.replace(scanner.noise, calibration_error_m=0.0))
 
 
 def _plans(tubes: Sequence[TubeModel], trials: int, seed: int, mixed: bool) -> Iterator[_Plan]:
@@ -185,7 +209,9 @@ def _draw(plan: _Plan, settings: _Settings, printed: bool) -> _Trial:
     """Draw the scene of one trial, which no sensor has a part in."""
     scene_seed, printed_seed, original_seed = plan.seeds
     rng = np.random.default_rng(scene_seed)
-    scene = random_scene(settings.rack, plan.types, settings.cap, settings.camera, rng, settings.variation)
+    camera = settings.camera
+    far_m = camera.face_distance_m if isinstance(camera, StereoCamera) else DISTANCE_M
+    scene = random_scene(settings.rack, plan.types, settings.cap, camera, rng, settings.variation, far_m)
     entry: dict[str, Any] = {
         "name": plan.name,
         "tubes": {tube.slot: _labware_name(tube.model) for tube in scene.tubes},
@@ -201,11 +227,11 @@ def _draw(plan: _Plan, settings: _Settings, printed: bool) -> _Trial:
         entry[label] = f"captures/{name}{suffix}"
         dressed = dataclasses.replace(scene, printed_cap=cap)
         shots.append(Shot(name, entry[label], dressed, first_ns + i * _RECAP_NS, seed))
-    entry["hint"] = _hint(scene, settings.camera, rng)
+    entry["hint"] = _hint(scene, camera, rng)
     return _Trial(entry, scene, tuple(shots))
 
 
-def _hint(scene: Scene, camera: StructuredLightCamera, rng: np.random.Generator) -> dict[str, Any]:
+def _hint(scene: Scene, camera: Camera, rng: np.random.Generator) -> dict[str, Any]:
     """Where somebody would click on the first slot's opening."""
     slot = scene.rack.all_slots[0]
     height_m = scene.rack.height_m + float(scene.bow.height_m(scene.rack, slot.center_m))
@@ -242,7 +268,7 @@ def _finish(aside: Path, settings: _Settings, drawn: Sequence[_Trial]) -> None:
         # Not named after the folder: the same seed gives the same bytes anywhere.
         "name": _session_name(settings, entries),
         "origin": "simulated",
-        "sensor": f"simulated-{settings.sensor}",
+        "sensor": f"simulated-{settings.label}",
         "rack": _labware_name(settings.rack),
         "printed_cap": _labware_name(settings.cap),
         "trials": entries,
@@ -267,6 +293,7 @@ def _write_labware(folder: Path, item: Labware) -> None:
 
 def _session_name(settings: _Settings, entries: list[dict[str, Any]]) -> str:
     """Name that tells sessions apart: sensor, rack and seed, and a digest of all that decides what is captured."""
-    content = f"{settings.camera} {settings.cap.name} {settings.variation} {entries}"
+    several = f" {settings.n_frames}" if settings.n_frames > 1 else ""
+    content = f"{settings.camera} {settings.cap.name} {settings.variation} {entries}{several}"
     digest = hashlib.sha256(content.encode()).hexdigest()[:8]
-    return f"{settings.sensor}-{settings.rack.name}-seed{settings.seed}-{digest}"
+    return f"{settings.label}-{settings.rack.name}-seed{settings.seed}-{digest}"

@@ -34,6 +34,7 @@ Pair = Annotated[tuple[Finite, Finite], BeforeValidator(_two)]
 Range = Annotated[Pair, _range(0.0, inf)]
 ShareRange = Annotated[Pair, _range(0.0, 1.0)]
 IndexRange = Annotated[Pair, _range(1.0, 2.5)]
+DistanceRange = Annotated[Pair, _range(0.05, 10.0)]
 TiltRange = Annotated[Pair, _range(0.0, 60.0)]
 BowRange = Annotated[Pair, _range(-5.0, 5.0)]
 RoughnessRange = Annotated[Pair, _range(0.01, 1.0)]
@@ -64,6 +65,7 @@ class SceneVariation(BaseModel):
     Attributes:
         fill: Share of the slots that hold a tube; at least one does.
         scanner_tilt_deg: Angle between the camera's axis and the rack's normal.
+        distance_m: Depth of the middle of the rack's face; null is what the camera is made for.
         rack_bow_mm: Height of the middles of the rack's sides over the centre of its face, drawn for x and y apart;
             positive is away from the base.
         scattering_per_mm: Of see-through walls, one value per trial; null keeps what the labware files say.
@@ -85,6 +87,7 @@ class SceneVariation(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
     fill: ShareRange = (0.10, 0.40)
     scanner_tilt_deg: TiltRange = (0.0, 20.0)
+    distance_m: DistanceRange | None = None
     rack_bow_mm: BowRange = (0.0, 0.0)
     scattering_per_mm: Range | None = None
     absorption_per_mm: Range | None = None
@@ -102,9 +105,9 @@ class SceneVariation(BaseModel):
     tolerances: Tolerances = Tolerances()
 
     def __repr_args__(self) -> Iterator[tuple[str | None, Any]]:
-        """Fields as they are printed. A rack that is not bowed is left out: names of sessions are digests of this."""
+        """Fields as they are printed; a flat rack and a usual distance are not: names of sessions are digests of this."""
         for name, value in super().__repr_args__():
-            if name != "rack_bow_mm" or value != (0.0, 0.0):
+            if (name, value) not in (("rack_bow_mm", (0.0, 0.0)), ("distance_m", None)):
                 yield name, value
 
 

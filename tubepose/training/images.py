@@ -26,11 +26,11 @@ from tubepose.errors import DetectorError
 from tubepose.labware import labware_sha256
 from tubepose.labware.tubes import RACK_CLASS
 from tubepose.report import write_aside, write_csv, write_text
+from tubepose.simulation.looks.exposure import Quality, expose
+from tubepose.simulation.looks.render import render
 from tubepose.simulation.parallel import in_processes
 from tubepose.training.labels import Label, label_objects
-from tubepose.training.render import render
 from tubepose.training.scenes import Stock, View, random_scene
-from tubepose.training.sensor import Quality, expose
 
 CLASSES = (RACK_CLASS, CAPPED_CLASS, OPEN_CLASS)
 """Class names in the order of their numbers."""

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tubepose.capture.frame import CameraIntrinsics
-from tubepose.training.render import Rendered
+from tubepose.simulation.looks.render import Rendered
 from tubepose.training.scenes import LearningScene, SceneObject
 from tubepose.transforms import FloatArray, transform_points
 

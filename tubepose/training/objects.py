@@ -9,6 +9,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from tubepose.labware import CapModel, RackModel, TubeModel
+from tubepose.simulation.looks.appearance import Surface, Texture
+from tubepose.simulation.looks.textures import SIZE, coded, collage, plain, random_color, random_ground
 from tubepose.simulation.meshes import (
     Mesh,
     box,
@@ -22,8 +24,6 @@ from tubepose.simulation.meshes import (
 )
 from tubepose.simulation.random_scene import straight_wall_m
 from tubepose.simulation.scene import printed_cap_mesh
-from tubepose.training.appearance import Surface, Texture
-from tubepose.training.textures import SIZE, coded, collage, plain, random_color, random_ground
 from tubepose.training.variants import cap_outline
 from tubepose.transforms import FloatArray, make_transform
 

@@ -13,15 +13,14 @@ from tubepose.capture.frame import CameraIntrinsics
 from tubepose.detection.model import visible_class
 from tubepose.labware import CapModel, RackModel, TubeModel
 from tubepose.labware.tubes import RACK_CLASS
+from tubepose.simulation.looks.appearance import NOTHING, Light, Part, Sensor, Surface
 from tubepose.simulation.meshes import Mesh, merge
 from tubepose.simulation.placement import lean
 from tubepose.training import objects
-from tubepose.training.appearance import NOTHING, Light, Part, Surface
 from tubepose.training.variants import fits, matching_tubes, vary_rack, vary_tube
 from tubepose.training.viewpoints import (
     SENSOR_CHANCE,
     SENSORS,
-    Sensor,
     any_camera,
     cut_to,
     random_light,

@@ -3,18 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Literal
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from tubepose.capture.frame import CameraIntrinsics
 from tubepose.simulation.camera import FULL_FOCAL_PX, FULL_RESOLUTION
-from tubepose.training.appearance import Lamp, Light
-from tubepose.training.textures import surroundings
+from tubepose.simulation.looks.appearance import Lamp, Light, Sensor
+from tubepose.simulation.looks.textures import surroundings
 from tubepose.transforms import FloatArray, invert_transform, make_transform, transform_points
 
-Sensor = Literal["projector", "lamp-gray", "color"]
 SENSORS: tuple[Sensor, ...] = ("projector", "lamp-gray", "color")
 SENSOR_CHANCE = (0.3, 0.2, 0.5)
 _SIZES = ((1.0, 1.0), (1.0, 0.75), (1.0, 0.5625), (0.75, 1.0))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,6 +12,8 @@ from numpy.typing import NDArray
 from tubepose.simulation.meshes import Mesh
 
 Float32Array = NDArray[np.float32]
+Sensor = Literal["projector", "lamp-gray", "color"]
+"""Kind of picture: gray under a scanner's projector, gray or in colour under lamps."""
 
 NOTHING = -1
 """Owner of table, walls and clutter, and of pixels that meet nothing."""

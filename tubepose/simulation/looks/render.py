@@ -16,8 +16,8 @@ import open3d as o3d
 from numpy.typing import NDArray
 
 from tubepose.capture.frame import CameraIntrinsics
+from tubepose.simulation.looks.appearance import NOTHING, Float32Array, Light, Part
 from tubepose.simulation.raycast import ray_tensor
-from tubepose.training.appearance import NOTHING, Float32Array, Light, Part
 
 _LAYERS = 6
 _OFFSET_M = 5e-5

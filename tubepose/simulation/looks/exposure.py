@@ -8,14 +8,18 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from tubepose.training.viewpoints import Sensor
+from tubepose.simulation.looks.appearance import Sensor
 
 Float32Array = NDArray[np.float32]
 Quality = Literal["any", "good"]
 
 
 def expose(
-    radiance: Float32Array, sensor: Sensor, rng: np.random.Generator, quality: Quality = "any"
+    radiance: Float32Array,
+    sensor: Sensor,
+    rng: np.random.Generator,
+    quality: Quality = "any",
+    noise_rng: np.random.Generator | None = None,
 ) -> NDArray[np.uint8]:
     """An 8-bit RGB picture (H, W, 3) of linear light; gray for the gray sensors.
 
@@ -25,6 +29,7 @@ def expose(
         rng: Source of randomness.
         quality: ``good`` is a camera that someone has set up: in focus, not moved, and next to nothing too bright.
             ``any`` has everything else as well.
+        noise_rng: Of the noise of pixels, where that shall differ between pictures by one camera; by default `rng`.
     """
     good = quality == "good"
     light = radiance
@@ -35,7 +40,7 @@ def expose(
     light = light * np.float32(rng.uniform(*((0.7, 1.0) if good else (0.4, 1.1))) / max(level, 1e-4))
     if sensor == "color":
         light = light * rng.uniform(0.85, 1.15, 3).astype(np.float32)
-    light = _noisy(light, sensor, rng)
+    light = _noisy(light, sensor, rng, noise_rng or rng)
     gamma = rng.uniform(1.6, 2.6) if rng.uniform() < 0.85 else 1.0
     picture = np.clip(light, 0, 1) ** np.float32(1 / gamma)
     if sensor == "color" and rng.uniform() < 0.5:
@@ -71,9 +76,11 @@ def _lens(light: Float32Array, rng: np.random.Generator, sharp: bool) -> Float32
     return np.asarray(light, np.float32)
 
 
-def _noisy(light: Float32Array, sensor: Sensor, rng: np.random.Generator) -> Float32Array:
-    """Shot noise and read noise."""
+def _noisy(
+    light: Float32Array, sensor: Sensor, rng: np.random.Generator, noise_rng: np.random.Generator
+) -> Float32Array:
+    """Shot noise and read noise, whose sizes are drawn from the first generator."""
     shape = light.shape if sensor == "color" else (*light.shape[:2], 1)
     shot, read = np.exp(rng.uniform(np.log(1e-4), np.log(1e-3))), np.exp(rng.uniform(np.log(5e-4), np.log(6e-3)))
     spread = np.sqrt(np.maximum(light, 0) * np.float32(shot) + np.float32(read**2))
-    return np.asarray(light + spread * rng.standard_normal(shape, np.float32), np.float32)
+    return np.asarray(light + spread * noise_rng.standard_normal(shape, np.float32), np.float32)
