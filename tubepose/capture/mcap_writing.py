@@ -130,7 +130,8 @@ def _shot(pixels: NDArray[np.uint8], kind: PictureFormat) -> dict[str, Any]:
 def _depth(depth_m: FloatArray, counted: bool) -> dict[str, Any]:
     """Depth in metres, or in whole millimetres where they are that and are asked for."""
     counts = np.rint(np.nan_to_num(depth_m) * 1e3)
-    if counted and counts.max(initial=0.0) < _MAX_COUNT and np.nanmax(np.abs(counts * 1e-3 - depth_m), initial=0.0) < _WHOLE_M:
+    off_m = np.nanmax(np.abs(counts * 1e-3 - depth_m), initial=0.0)
+    if counted and counts.max(initial=0.0) < _MAX_COUNT and off_m < _WHOLE_M:
         return _image(counts.astype("<u2"), "16UC1")
     return _image(depth_m.astype("<f4"), "32FC1")
 

@@ -238,5 +238,6 @@ def place_rack(
             return T_camera_rack
     raise LabwareError(
         f"rack '{rack.name}' ({rack.outline_mm[0]:g} x {rack.outline_mm[1]:g} mm) does not fit into the view "
-        f"of the simulated camera at {distance_m[0]:g} to {distance_m[1]:g} m; choose a smaller rack, or a distance_m in --scenes that is larger"
+        f"of the simulated camera at {distance_m[0]:g} to {distance_m[1]:g} m; choose a smaller rack, or a "
+        "larger distance_m in --scenes"
     )

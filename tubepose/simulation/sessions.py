@@ -20,9 +20,9 @@ from tubepose.errors import CaptureError, ConfigError
 from tubepose.labware import CapModel, Labware, RackModel, TubeModel, catalogue
 from tubepose.simulation.camera import default_camera
 from tubepose.simulation.parallel import in_processes
+from tubepose.simulation.placement import DISTANCE_M
 from tubepose.simulation.random_scene import DEFAULT_VARIATION, random_scene
 from tubepose.simulation.scene import Scene
-from tubepose.simulation.placement import DISTANCE_M
 from tubepose.simulation.shooting import FRAME_NS, SENSORS, Camera, CaptureFormat, Shooting, Shot, sensor_label
 from tubepose.simulation.stereo.stereo_camera import StereoCamera
 from tubepose.simulation.truth import write_exact_truth
@@ -112,8 +112,8 @@ def simulate_session(
             sensor.
         cap: The printed cap.
         sensor: Name of a simulated sensor.
-        resolution: Width and height of the square image, pixels; not of ``stereo``.
-        camera: The camera of the sensor ``stereo``, and of no other.
+        resolution: Width and height of a scanner's square image, pixels.
+        camera: Of the sensor ``stereo``, and of no other.
         frames: Frames of each capture, all of the same unmoved scene; more than one need the format ``mcap``.
         variation: Ranges that the scenes are drawn from. At least one slot is filled.
         mixed: Any of the types in each trial.
@@ -132,7 +132,7 @@ def simulate_session(
     """
     _check_out(out)
     _check_tubes(tubes)
-    _check_numbers(trials=(trials, 1), seed=(seed, 0), resolution=(resolution, 32), threads=(threads, 1), frames=(frames, 1))
+    _check_numbers(trials=(trials, 1), seed=(seed, 0), resolution=(resolution, 32), threads=(threads, 1))
     _check_names(sensor, capture_format, frames)
     seen_by = _camera(sensor, camera, resolution, calibration_error)
     settings = _Settings(rack, tuple(tubes), cap, seen_by, sensor, variation, capture_format, seed, frames)
@@ -181,8 +181,8 @@ def _check_names(sensor: str, capture_format: str, frames: int) -> None:
 
     if frames > 1 and capture_format != "mcap":
         raise ConfigError(f"{frames} frames do not go into a {capture_format}, which holds one; choose the format mcap")
-    if frames > MAX_FRAMES:
-        raise ConfigError(f"frames is {frames}; expected {MAX_FRAMES} at most")
+    if not 1 <= frames <= MAX_FRAMES:
+        raise ConfigError(f"frames is {frames}; expected 1 to {MAX_FRAMES}")
 
 
 def _camera(sensor: str, camera: StereoCamera | None, resolution: int, calibration_error: bool) -> Camera:

@@ -28,9 +28,7 @@ FRAME_NS = 33_333_333
 class Sensor(Protocol):
     """A simulated sensor."""
 
-    def __call__(
-        self, scene: Scene, camera: Any, rng: np.random.Generator, *, threads: int = 1
-    ) -> RgbdFrame:
+    def __call__(self, scene: Scene, camera: Any, rng: np.random.Generator, *, threads: int = 1) -> RgbdFrame:
         """Capture a scene; the number of threads changes nothing but the time."""
         ...
 

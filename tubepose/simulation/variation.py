@@ -105,7 +105,7 @@ class SceneVariation(BaseModel):
     tolerances: Tolerances = Tolerances()
 
     def __repr_args__(self) -> Iterator[tuple[str | None, Any]]:
-        """Fields as they are printed; a flat rack and a usual distance are not: names of sessions are digests of this."""
+        """Fields as they are printed. Not a flat rack, not a usual distance: sessions are named by digests of this."""
         for name, value in super().__repr_args__():
             if (name, value) not in (("rack_bow_mm", (0.0, 0.0)), ("distance_m", None)):
                 yield name, value

@@ -52,16 +52,20 @@ class StereoView:
 
     def frame(self, rng: np.random.Generator) -> RgbdFrame:
         """One frame; its capture name is empty and its time unknown."""
+        camera, depth = self.camera, self.frame_depth_m(rng)
+        image = expose(self.radiance, "color", np.random.default_rng(self.exposure_seed), "good", noise_rng=rng)
+        return RgbdFrame(
+            camera.intrinsics.backproject(depth), image, camera.intrinsics, None, "", sensor=camera.name, simulated=True
+        )
+
+    def frame_depth_m(self, rng: np.random.Generator) -> FloatArray:
+        """Depth (H, W) of one frame in the camera's steps, metres; NaN where nothing is measured."""
         camera = self.camera
         depth = self.depth_m + depth_error_m(camera, self.depth_m, rng, temporal=True)
         fresh = smooth_field((depth.shape[0], depth.shape[1]), (PATCH_PX, PATCH_PX), rng)
         field = np.sqrt(1 - FLICKER) * self.patches + np.sqrt(FLICKER) * fresh
         depth[field > _upper(camera.missing_share)] = np.nan
-        depth = counted_depth_m(camera, depth)
-        image = expose(self.radiance, "color", np.random.default_rng(self.exposure_seed), "good", noise_rng=rng)
-        return RgbdFrame(
-            camera.intrinsics.backproject(depth), image, camera.intrinsics, None, "", sensor=camera.name, simulated=True
-        )
+        return counted_depth_m(camera, depth)
 
 
 def counted_depth_m(camera: StereoCamera, depth_m: FloatArray) -> FloatArray:

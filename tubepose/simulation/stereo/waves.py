@@ -35,7 +35,7 @@ def smooth_field(shape: tuple[int, int], length_px: tuple[float, float], rng: np
     white = rng.standard_normal((rows + 2 * reach_v, columns + 2 * reach_u), dtype=np.float32)
     field = cv2.sepFilter2D(white, cv2.CV_32F, kernels[0], kernels[1])
     field = field[reach_v : reach_v + rows, reach_u : reach_u + columns]
-    field /= np.float32(np.sqrt(np.prod([np.sum(kernel**2) for kernel in kernels])))
+    field = field / np.float32(np.sqrt(np.prod([np.sum(kernel**2) for kernel in kernels])))
     if max(cells) > 1:
         field = cv2.resize(field, (columns * cells[0], rows * cells[1]), interpolation=cv2.INTER_CUBIC)
     top, left = margin * cells[1], margin * cells[0]
