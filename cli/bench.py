@@ -54,6 +54,10 @@ def bench(
         bool, typer.Option("--all-tubes", help="Any of a session's types may stand in any trial: tells types apart.")
     ] = False,
     published: Annotated[bool, typer.Option("--published", help="Add the paper's own figures to the tables.")] = False,
+    average: Annotated[
+        str | None,
+        typer.Option(metavar="N|all", help="Fuse so many frames of a static recording, or all, into one."),
+    ] = None,
     fail_fast: Annotated[bool, typer.Option("--fail-fast", help="Stop at the first bad capture.")] = False,
 ) -> None:
     """Run every method on sessions, compare with the ground truth, and print the paper's two tables.
@@ -64,6 +68,7 @@ def bench(
     from dataclasses import replace
 
     from tubepose.batch import session_jobs
+    from tubepose.capture.fusion import read_average
     from tubepose.config import load_config
     from tubepose.errors import kept
     from tubepose.truth_tables import with_exact_rack
@@ -73,11 +78,12 @@ def bench(
     from tubepose_cli.truth import measure_sessions
 
     settings = load_config(config)
+    fused = read_average(average) if average is not None else 1
     names = read_methods(methods)
     detector_for = make_detector(detector, model, boxes, classes, layout, settings)
     jobs: list[Job] = []
     folders, problems = find_sessions(sessions or [sample_session()], fail_fast=fail_fast)
-    measured = measure_sessions(folders, out, exact=exact_truth, fail_fast=fail_fast)
+    measured = measure_sessions(folders, out, exact=exact_truth, average=fused, fail_fast=fail_fast)
     if not measured.sessions:
         finish([*problems, *measured.problems])  # before anything of an earlier run is written over
     for session in measured.sessions:
@@ -96,7 +102,7 @@ def bench(
             *(session.folder for session in measured.sessions),
         ],
         labware=[] if exact_truth else [s.printed_cap for s in measured.sessions if s.printed_cap is not None],
-        problems=problems, detector=detector, ground_truth_config=measured.config,
+        problems=problems, detector=detector, averaged=average is not None, ground_truth_config=measured.config,
     )  # fmt: skip
     if len(measured.truth):
         _report(tables, measured, jobs, names, settings, out, seeds, published)

@@ -82,6 +82,10 @@ def estimate(
         bool,
         typer.Option("--require-unambiguous", help="Exit 1 where a rack may stand another way round (after writing)."),
     ] = False,
+    average: Annotated[
+        str | None,
+        typer.Option(metavar="N|all", help="Fuse so many frames of a static recording, or all, into one."),
+    ] = None,
     seeds: Annotated[int, typer.Option(min=1, help="Seeds of a stochastic method: 0 to N-1.")] = 1,
     config: Annotated[Path | None, typer.Option(help="YAML file that changes defaults (docs/method.md).")] = None,
     overlays: Annotated[bool, typer.Option(help="Write one overlay picture per frame.")] = True,
@@ -91,6 +95,7 @@ def estimate(
 
     Writes racks, sensor, slots, estimates, checks, labware_check and timings.csv, run.json and overlays/ into --out.
     """
+    from tubepose.capture.fusion import read_average
     from tubepose.capture.session import SESSION_FILE, is_session
     from tubepose.config import load_config
     from tubepose.errors import CaptureError, kept
@@ -111,6 +116,7 @@ def estimate(
     from tubepose_cli.show import finish, say
 
     settings = load_config(config)
+    fused = read_average(average) if average is not None else 1
     choice = read_rack(rack, pitch, slot)
     tube_models = read_tubes(tubes) if tubes is not None else ()
     if not any(path.exists() for path in captures):  # before seconds of imports
@@ -125,7 +131,15 @@ def estimate(
     for path in captures:
         with kept(None if fail_fast else problems):
             found, unread = capture_jobs(
-                path, choice, tube_models, settings, unit=unit, hints=told, topics=topics, fail_fast=fail_fast
+                path,
+                choice,
+                tube_models,
+                settings,
+                unit=unit,
+                hints=told,
+                topics=topics,
+                average=fused,
+                fail_fast=fail_fast,
             )
             distinct, twins = refuse_twins(found, jobs)
             if twins and fail_fast:
@@ -143,7 +157,7 @@ def estimate(
             *(path for path in (used_model(detector, model), boxes, classes, hints, config) if path is not None),
             *(path for path in captures if path.exists() and (path.name == SESSION_FILE or is_session(path))),
         ],
-        problems=problems, detector=detector,
+        problems=problems, detector=detector, averaged=average is not None,
     )  # fmt: skip
     _tell(tables, several=len(methods) > 1)
     if tubes is None and any(not job.tubes for job in jobs):

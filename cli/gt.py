@@ -14,6 +14,10 @@ from tubepose_cli.paths import named
 def gt(
     sessions: Annotated[list[Path], typer.Argument(parser=named, metavar="SESSIONS", help="Session folders.")],
     out: Annotated[Path, typer.Option(parser=named, metavar="PATH", help="Folder for the results.")],
+    average: Annotated[
+        str | None,
+        typer.Option(metavar="N|all", help="Fuse so many frames of a static recording, or all, into one."),
+    ] = None,
     fail_fast: Annotated[bool, typer.Option("--fail-fast", help="Stop at the first bad capture.")] = False,
 ) -> None:
     """Measure the true poses of tubes from their printed caps (plane segmentation + square template ICP).
@@ -21,6 +25,7 @@ def gt(
     Writes ground_truth.csv and run.json into --out; on simulated sessions ground_truth_floor.csv too, its error against
     the exact truth.
     """
+    from tubepose.capture.fusion import read_average
     from tubepose.config import Config
     from tubepose.provenance import inputs_sha256, run_record
     from tubepose.report.writing import write_json
@@ -28,9 +33,10 @@ def gt(
     from tubepose_cli.show import finish, say
     from tubepose_cli.truth import measure_sessions
 
+    fused = read_average(average) if average is not None else 1
     folders, problems = find_sessions(sessions, fail_fast=fail_fast)
     used = inputs_sha256(folders, out)
-    measured = measure_sessions(folders, out, fail_fast=fail_fast)
+    measured = measure_sessions(folders, out, average=fused, fail_fast=fail_fast)
     problems += measured.problems
     if not measured.sessions:
         finish(problems)

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from tubepose.batch import DetectorFactory, Job, UnnamedJob
+    from tubepose.capture.fusion import Average
     from tubepose.config import Config
     from tubepose.labware import TubeModel
     from tubepose_cli.hints import HintChoice
@@ -107,6 +108,7 @@ def capture_jobs(
     unit: str | None = None,
     hints: HintChoice | None = None,
     topics: Mapping[str, str | None] | None = None,
+    average: Average = 1,
     fail_fast: bool = False,
 ) -> tuple[list[Job | UnnamedJob], list[str]]:
     """Jobs of one typed path (a session's trials, or the captures found there), and what could not be opened.
@@ -127,7 +129,7 @@ def capture_jobs(
                 f"{path}: {', '.join(idle)} given, but a session says that itself: unit, topics, and a trial's hint; "
                 "leave it out, or give the captures one by one"
             )
-        known, problems = session_jobs(load_session(path), fail_fast=fail_fast)
+        known, problems = session_jobs(load_session(path, average), fail_fast=fail_fast)
         if choice.open:
             find = rack_finder(choice, config)
             return [
@@ -140,7 +142,7 @@ def capture_jobs(
     if not path.exists():
         raise CaptureError(no_such_file(path))
     topic = {f"{kind}_topic": name for kind, name in (topics or {}).items()}
-    opened = open_captures(path, unit=unit, **topic)
+    opened = open_captures(path, unit=unit, average=average, **topic)
     told = [(capture, *(hints.of(capture.name) if hints else (None, False))) for capture in opened]
     if choice.rack is not None:
         rack = choice.rack

@@ -36,6 +36,7 @@ def run_estimates(
     overlays: bool = True,
     fail_fast: bool = False,
     warm_up: bool = False,
+    averaged: bool = False,
     inputs: Sequence[Path] = (),
     labware: Sequence[Labware] = (),
     problems: Sequence[str] = (),
@@ -44,7 +45,7 @@ def run_estimates(
     """Run jobs, write their tables, run.json and overlays/ into `out`, and say how noisy they are and what contradicts.
 
     The tables are racks, sensor, slots, estimates, checks, labware_check and timings.csv.
-    `problems` are those from before, and `labware`
+    `problems` are those from before, `averaged` says that frames were to be fused, and `labware` is
     what was used besides, for the record. `JUDGED_FILES` of an earlier run are removed.
 
     Raises:
@@ -56,7 +57,7 @@ def run_estimates(
     from tubepose.provenance import inputs_sha256, pinned_threads, run_record
     from tubepose.report.writing import make_folder, remove_files, write_json
     from tubepose.result_tables import Tables
-    from tubepose_cli.show import describe_noise, describe_sizes, progress, say, say_when_compiling
+    from tubepose_cli.show import describe_averaging, describe_noise, describe_sizes, progress, say, say_when_compiling
 
     taken: dict[str, tuple[str, ...]] = {}
 
@@ -93,6 +94,8 @@ def run_estimates(
         **more,
     )
     write_json(out / "run.json", record)
+    for line in describe_averaging(tables.sensor) if averaged else ():
+        say(line)
     if tables.sensor:
         say(describe_noise(tables.sensor))
     for line in describe_sizes(sizes):

@@ -100,6 +100,16 @@ def describe_noise(rows: Sequence[Mapping[str, Any]]) -> str:
     return "; ".join([f"{text} ({where}), edges {middle('edge_blur_px', edges):.1f} px{assumed}", *notes[:1]])
 
 
+def describe_averaging(rows: Sequence[Mapping[str, Any]]) -> list[str]:
+    """How many frames were averaged, and a line for each average that frames are left out of; rows of sensor.csv."""
+    counts = sorted({int(row["n_frames"]) for row in rows})
+    if not rows or (counts[-1] == 1 and not any(row["n_left_out"] for row in rows)):
+        return ["no capture has more than one frame: nothing is averaged"] if rows else []
+    each = f"{counts[0]}" if counts[0] == counts[-1] else f"{counts[0]} to {counts[-1]}"
+    lines = [f"averaged: {each} frames in each of {len(rows)}; the noise is that of the averages"]
+    return lines + [str(row["left_out_reason"]) for row in rows if row["n_left_out"]]
+
+
 def describe_sizes(rows: Sequence[Mapping[str, Any]]) -> list[str]:
     """A line for each size that contradicts its file, from the rows of labware_check.csv over the run."""
     things = {

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     import pandas as pd
 
+    from tubepose.capture.fusion import Average
     from tubepose.capture.session import Session
 
 
@@ -39,7 +40,7 @@ class MeasuredTruth:
 
 
 def measure_sessions(
-    folders: Sequence[Path], out: Path, *, exact: bool = False, fail_fast: bool = False
+    folders: Sequence[Path], out: Path, *, exact: bool = False, average: Average = 1, fail_fast: bool = False
 ) -> MeasuredTruth:
     """Measure all sessions, or take the exact poses of simulated ones, and write ground_truth.csv into `out`, if any.
 
@@ -68,7 +69,7 @@ def measure_sessions(
     problems: list[str] = []
     for folder in folders:
         with kept(None if fail_fast else problems):
-            session = load_session(folder)
+            session = load_session(folder, average)
             twin = next((other for other in sessions if other.name == session.name), None)
             if twin is not None:
                 same = f"its session name '{session.name}' is that of {twin.folder} too"
@@ -91,7 +92,7 @@ def measure_sessions(
                 tables.truth += exact_truth_rows(session, keep)
     truth, floor = to_table(tables.truth, TRUTH_COLUMNS), to_table(tables.floor, FLOOR_COLUMNS)
     write_csv(out / "ground_truth.csv", truth)
-    notes = [EXACT_NOTE if exact else refused_note(truth)]
+    notes = [EXACT_NOTE if exact else refused_note(truth), *tables.notes]
     if len(floor):
         write_csv(out / FLOOR_FILE, floor)
         notes.append(floor_note(floor))

@@ -122,6 +122,14 @@ SENTENCES = {
         "two places look like {name} (the better one by a ratio of {value:.2f} in evidence, {limit:g} expected): "
         "too little of its top is seen"
     ),
+    # Frames of a recording that are averaged.
+    "scene_moved": (
+        "{value:.0f} of {limit:.0f} frames of {name} are left out of the average, as something in the scene moved: "
+        "{detail}"
+    ),
+    "camera_moved": (
+        "{value:.0f} of {limit:.0f} frames of {name} are left out of the average, as the camera moved: {detail}"
+    ),
     # Tubes: what stands in a slot.
     "no_points_above": "no points above the rack's top",
     "few_points": "{value:.0f} points above the rack's top, at least {limit:.0f} expected",

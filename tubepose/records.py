@@ -11,7 +11,7 @@ import pandas as pd
 from scipy.spatial.transform import Rotation
 
 from tubepose.capture.frame import RgbdFrame
-from tubepose.checks import Check, mark_codes
+from tubepose.checks import Check, mark_codes, said, sentence
 from tubepose.detection import best_rack
 from tubepose.occupancy import held_slots, stated_slots
 from tubepose.pose_errors import COVARIANCE_COLUMNS, upper_half
@@ -39,7 +39,7 @@ SENSOR_COLUMNS = (
     "session", "trial", "capture", "frame", "timestamp_ns", "source", "independent_m", "independent_relative_std",
     "shared_m", "shared_relative_std", "correlation_m", "spacing_m", "distance_m", "n_patches", "cap_radius_m",
     "cap_slope_std", "cap_height_std_m", "outlier_source", "outlier_share", "edge_source", "edge_blur_px",
-    "edge_std_px", "note",
+    "edge_std_px", "note", "n_frames", "n_left_out", "left_out_code", "left_out_reason",
 )  # fmt: skip
 CAP_RADIUS_M = 6.5e-3
 """Radius of the discs that sensor.csv speaks of: a cap of a 13 mm tube."""
@@ -171,9 +171,33 @@ def sensor_row(keys: Row, frame: RgbdFrame, noise: SensorNoise) -> Row:
         **keys,
         "timestamp_ns": frame.timestamp_ns,
         **{name: getattr(noise, name) for name in SENSOR_COLUMNS if hasattr(noise, name)},
+        **averaging_columns(frame),
         "cap_radius_m": CAP_RADIUS_M,
         "cap_slope_std": noise.slope_std(CAP_RADIUS_M, noise.distance_m),
         "cap_height_std_m": noise.height_std_m(CAP_RADIUS_M, noise.distance_m),
+    }
+
+
+MOST_NUMBERED = 8
+"""Frames that are told by number."""
+
+
+def averaging_columns(frame: RgbdFrame) -> Row:
+    """How many frames a frame was fused of, and which are left out of it and why."""
+    fused = frame.averaging
+    if fused is None:
+        return {"n_frames": 1, "n_left_out": 0, "left_out_code": "", "left_out_reason": ""}
+    n_left = len(fused.left_out)
+    words = ""
+    if n_left:
+        listed = [str(number) for number in fused.left_out[:MOST_NUMBERED]]
+        detail = f"frame{'s' if n_left > 1 else ''} {', '.join(listed)}{', ...' if n_left > MOST_NUMBERED else ''}"
+        words = sentence(said(fused.reason_code, detail, n_left, fused.n_frames), frame.capture)
+    return {
+        "n_frames": fused.n_frames - n_left,
+        "n_left_out": n_left,
+        "left_out_code": fused.reason_code,
+        "left_out_reason": words,
     }
 
 

@@ -16,7 +16,7 @@ from tubepose.capture.session import Session, Trial
 from tubepose.errors import CaptureError, ConfigError, TubePoseError, kept
 from tubepose.ground_truth import GroundTruthConfig, GroundTruthResult, measure_ground_truth
 from tubepose.pose_errors import pose_errors
-from tubepose.records import POSE_COLUMNS, Row, pose_columns
+from tubepose.records import POSE_COLUMNS, Row, averaging_columns, pose_columns
 from tubepose.simulation import read_exact_truth
 from tubepose.transforms import FloatArray
 
@@ -47,11 +47,13 @@ class TruthTables:
         truth: One per declared tube of a trial with a printed capture.
         floor: One per measured tube of a simulated session.
         problems: One line per trial that could not be measured.
+        notes: One line per average that frames are left out of.
     """
 
     truth: list[Row] = field(default_factory=list)
     floor: list[Row] = field(default_factory=list)
     problems: list[str] = field(default_factory=list)
+    notes: list[str] = field(default_factory=list)
 
 
 def measure_session(
@@ -81,6 +83,9 @@ def _measure_trial(session: Session, trial: Trial, tables: TruthTables, config: 
     frame = next(trial_capture(session, trial, trial.printed).frames(), None)
     if frame is None:
         raise CaptureError(f"{session.folder / trial.printed}: no frame in it")
+    left_out = averaging_columns(frame)["left_out_reason"]
+    if left_out:
+        tables.notes.append(f"session {session.name}, trial {trial.name}, ground truth: {left_out}")
     refuse_mirrored(frame)
     refuse_foreign_frame(frame)
     tubes = {slot: session.tubes[name] for slot, name in trial.tubes.items()}

@@ -50,6 +50,23 @@ class CameraIntrinsics:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class Averaging:
+    """What a frame was fused of.
+
+    Attributes:
+        n_frames: Frames that were read.
+        left_out: Numbers of those that show something else and are not in it.
+        reason_code: Why they are not: ``scene_moved``, ``camera_moved``, or empty if none is left out.
+        counts: Frames with depth at each pixel, shape (H, W).
+    """
+
+    n_frames: int
+    left_out: tuple[int, ...]
+    reason_code: str
+    counts: NDArray[np.uint16]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class RgbdFrame:
     """Image and cloud of one moment.
 
@@ -64,6 +81,7 @@ class RgbdFrame:
         organised: Whether neighbouring pixels are neighbours in space.
         sensor: What recorded it, as far as is known.
         simulated: True when the capture says that it is simulated.
+        averaging: What it was fused of; None for a frame as it was recorded.
     """
 
     cloud_m: FloatArray
@@ -75,6 +93,7 @@ class RgbdFrame:
     organised: bool = True
     sensor: str = "unknown"
     simulated: bool = False
+    averaging: Averaging | None = None
 
     @property
     def points_m(self) -> FloatArray:

@@ -11,6 +11,7 @@ from typing import Any, Literal
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from tubepose.capture.description import Unit
+from tubepose.capture.fusion import Average
 from tubepose.capture.hints import SlotHint, read_hint
 from tubepose.errors import CaptureError, LabwareError
 from tubepose.labware import CapModel, RackModel, TubeModel, load_cap, load_rack, load_tube, unique_tubes
@@ -85,6 +86,7 @@ class Session(BaseModel):
         rack: The rack of every trial.
         printed_cap: The printed cap, or None where no trial has one.
         tubes: Every tube model that the trials name, by the name that they use.
+        average: Frames of its recordings that are fused into one, as `open_captures` takes it.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
@@ -98,6 +100,7 @@ class Session(BaseModel):
     printed_cap: CapModel | None
     tubes: dict[str, TubeModel]
     trials: tuple[Trial, ...]
+    average: Average = 1
 
     def tubes_of(self, trial: Trial) -> tuple[TubeModel, ...]:
         """The kinds of tube in a trial, each once, in a fixed order."""
@@ -114,8 +117,12 @@ def is_session(path: Path) -> bool:
     return (path / SESSION_FILE).is_file()
 
 
-def load_session(path: Path) -> Session:
+def load_session(path: Path, average: Average = 1) -> Session:
     """Read a session folder (or its `session.yaml`) and the labware that it names.
+
+    Args:
+        path: The folder, or the file.
+        average: Frames of its recordings that are fused into one, as `open_captures` takes it.
 
     Raises:
         CaptureError: No session there, or one that breaks the format.
@@ -145,6 +152,7 @@ def load_session(path: Path) -> Session:
         printed_cap=cap,
         tubes=tubes,
         trials=data.trials,
+        average=average,
     )
 
 

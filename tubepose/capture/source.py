@@ -11,6 +11,7 @@ from typing import Literal, Protocol
 from tubepose.capture.description import Unit
 from tubepose.capture.folder import FolderCapture, PlyCapture, is_capture_folder, is_remains
 from tubepose.capture.frame import RgbdFrame
+from tubepose.capture.fusion import Average, AveragedCapture
 from tubepose.capture.mcap import McapCapture
 from tubepose.capture.topics import TopicChoice
 from tubepose.errors import CaptureError
@@ -89,6 +90,7 @@ def open_captures(
     image_topic: str | None = None,
     depth_topic: str | None = None,
     info_topic: str | None = None,
+    average: Average = 1,
 ) -> list[Capture]:
     """Find the captures at a path; nothing of their content is read yet.
 
@@ -101,6 +103,7 @@ def open_captures(
         image_topic: Image or CompressedImage topic of MCAP files.
         depth_topic: Topic of depth images of MCAP files.
         info_topic: CameraInfo topic of MCAP files.
+        average: Frames in a row, of a static recording, that are fused into one; ``all`` of a capture.
 
     Returns:
         Captures in sorted order; those of a directory are named by their path in it.
@@ -114,11 +117,15 @@ def open_captures(
     if path.is_file() or _is_closed(path) or is_capture_folder(path):
         capture = opener.open(path, name or (path.stem if path.is_file() else path.resolve().name))
         if capture is not None:
-            return [capture]
+            return _averaged([capture], average)
         raise CaptureError(
             f"{path}: expected a capture folder, or a file ending in .ply or .mcap, found '{path.suffix}'"
         )
-    return _search(path, opener)
+    return _averaged(_search(path, opener), average)
+
+
+def _averaged(captures: list[Capture], average: Average) -> list[Capture]:
+    return captures if average == 1 else [AveragedCapture(capture, average) for capture in captures]
 
 
 @dataclass(frozen=True, slots=True)
