@@ -1074,3 +1074,37 @@ def test_overlays_of_odd_names_do_not_meet(small_session: Path, tmp_path: Path) 
     assert ended.code == 0, ended.err
     names = sorted(path.name for path in (tmp_path / "out" / "overlays").iterdir())
     assert names == ["a_b-0000.png", "a_b-2-0000.png", f"{long[:100]}-0000.png"]
+
+
+@pytest.fixture(scope="module")
+def recorded_session(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """One trial of the small rack as recordings of three frames."""
+    out = tmp_path_factory.mktemp("recorded") / "session"
+    ended = tubepose(
+        "simulate", out, "--rack", SMALL_RACK, "--tubes", SMALL_TUBES[1], "--trials", "1", "--seed", "9",
+        "--resolution", "400", "--fill", "0.2", "--threads", "1", "--frames", "3",
+    )  # fmt: skip
+    assert ended.code == 0, ended.err
+    return out
+
+
+def test_frames_of_recordings_are_averaged(tmp_path: Path, recorded_session: Path) -> None:
+    one = tubepose("bench", recorded_session, "--average", "all", "--methods", "profile", "--out", tmp_path / "a")
+    assert one.code == 0, one.err
+    assert "averaged: 3 frames in each of 1" in one.err
+    sensor = pd.read_csv(tmp_path / "a" / "sensor.csv")
+    assert sensor[["n_frames", "n_left_out"]].to_numpy().tolist() == [[3, 0]]
+    two = tubepose(
+        "estimate", recorded_session, "--average", "2", "--detector", "geometric", "--out", tmp_path / "b",
+    )  # fmt: skip
+    assert two.code == 0, two.err
+    assert pd.read_csv(tmp_path / "b" / "sensor.csv")[["frame", "n_frames"]].to_numpy().tolist() == [[0, 2], [2, 1]]
+
+
+def test_average_is_told_where_nothing_is_averaged_and_refused_where_it_is_no_number(
+    tmp_path: Path, small_session: Path
+) -> None:
+    wrong = tubepose("gt", small_session, "--average", "some", "--out", tmp_path / "c")
+    assert (wrong.code, wrong.errors) == (1, ["error: --average some: expected a number of frames, 2 or more, or all"])
+    ended = tubepose("gt", small_session, "--average", "all", "--out", tmp_path / "d")
+    assert ended.code == 0, ended.err

@@ -86,7 +86,7 @@ def motion_between(first: Still, second: Still) -> str:
         second: Another one of the same size.
     """
     changed, told = _depth_changed(first, second)
-    share = int(np.count_nonzero(changed)) / max(np.count_nonzero(told), 1)
+    share = float(np.mean(changed[told])) if told.any() else 0.0
     if first.gray is not None and second.gray is not None:
         look = _picture_changed(first.gray, second.gray, first.tile_px, max(first.noise, second.noise))
         textured = max(int(np.count_nonzero(look.textured)), 1)
