@@ -13,6 +13,7 @@ from tubepose_cli import data, detector, labware
 from tubepose_cli.bench import bench
 from tubepose_cli.estimate import estimate
 from tubepose_cli.gt import gt
+from tubepose_cli.sensor import sensor
 from tubepose_cli.simulate import simulate
 
 app = typer.Typer(
@@ -22,7 +23,7 @@ app = typer.Typer(
     add_completion=False,
     pretty_exceptions_enable=False,
 )
-for _command in (estimate, gt, bench, simulate):
+for _command in (estimate, gt, bench, simulate, sensor):
     app.command()(_command)
 app.add_typer(labware.app, name="labware")
 app.add_typer(data.app, name="data")

@@ -94,6 +94,8 @@ ALLOWED: dict[str, set[str]] = {
         "scene",
         "stage_times",
     },
+    "camera_report": {"capture", "config", "expectation", "labware", "sensor"},
+    "expectation": {"capture", "config", "labware", "profile", "sensor"},
     "ground_truth": {"capture", "labware"},
     "simulation": {"capture", "compiled", "labware"},
     "statistics": set(),

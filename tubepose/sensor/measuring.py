@@ -78,11 +78,23 @@ def measure_noise(
 
 
 def _source(name: str, surface: LevelSurface, config: SensorConfig) -> _Source | None:
-    """The noise of a surface; discs are laid on the table alone, where no opening cuts into them."""
-    discs, area_m2, outliers = measure_discs(surface, config) if name == TABLE else ((), np.nan, np.nan)
+    """The noise of a surface; discs are not laid on a rack's top, whose openings cut into them."""
+    discs, area_m2, outliers = measure_discs(surface, config) if name != RACK_TOP else ((), np.nan, np.nan)
     spacing = float(np.sqrt(area_m2)) if np.isfinite(area_m2) else point_spacing_m(surface.rows)
     parts = error_parts(surface, spacing)
     return None if parts is None else _Source(name, surface, parts, spacing, discs, outliers)
+
+
+def noise_on_surface(name: str, surface: LevelSurface, config: SensorConfig) -> SensorNoise | None:
+    """Noise of a surface alone, under a name of its own; None where too few of its points tell it.
+
+    Args:
+        name: What `SensorNoise.source` shall say.
+        surface: The surface.
+        config: How noise is measured, and what is assumed of what is not.
+    """
+    source = _source(name, surface, config)
+    return None if source is None else _noise(source, config, "")
 
 
 def point_spacing_m(rows: FloatArray) -> float:

@@ -88,7 +88,7 @@ def table_beside(
     thin = rows[:: max(1, len(rows) // FITTED_POINTS)]
     bins = np.floor(thin[:, 2] / BIN_M).astype(int)
     level = (bins.min() + int(np.argmax(np.bincount(bins - bins.min()))) + 0.5) * BIN_M
-    return _fitted(rows, _most_level(thin[np.abs(thin[:, 2] - level) < FIRST_BAND_M]), config)
+    return fitted_surface(rows, _most_level(thin[np.abs(thin[:, 2] - level) < FIRST_BAND_M]), config)
 
 
 def _most_level(thin: FloatArray) -> FloatArray:
@@ -131,7 +131,7 @@ def top_of_rack(
     low, solid = solid_map(rack, config.inside_m)
     pose, band = parts(T_camera_rack), (rack.height_m, config.max_bow_m)
     rows = kernels.within(frame.points_m, *pose, low, MAP_CELL_M, solid, *band)
-    return _fitted(rows, rows[:: max(1, len(rows) // FITTED_POINTS)], config)
+    return fitted_surface(rows, rows[:: max(1, len(rows) // FITTED_POINTS)], config)
 
 
 @lru_cache(maxsize=32)
@@ -157,8 +157,17 @@ def _terms(x: FloatArray, y: FloatArray) -> FloatArray:
     return np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], axis=-1)
 
 
-def _fitted(rows: FloatArray, thin: FloatArray, config: SensorConfig) -> LevelSurface | None:
-    """The surface through thinned points: least squares, points more than `CLIP` standard deviations off left out."""
+def fitted_surface(rows: FloatArray, thin: FloatArray, config: SensorConfig) -> LevelSurface | None:
+    """The low-order surface through points: least squares, points more than `CLIP` standard deviations off left out.
+
+    Args:
+        rows: Points, shape (N, 4): x and y along the surface, z along its normal, and depth, metres.
+        thin: Some of them, which tell what is of the surface.
+        config: How many there must be.
+
+    Returns:
+        The surface; None where too few points are of it.
+    """
     surface = np.zeros(6)
     for _ in range(8):
         if len(thin) < config.least_points / 10 or len(rows) < config.least_points:
