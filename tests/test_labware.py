@@ -115,6 +115,8 @@ def test_the_papers_racks(
         ("chen2023-hard-5x10", 50, "A1", "E10"),
         ("steel-round-13mm-5x10", 50, "A1", "E10"),
         ("steel-round-16mm-5x10", 50, "A1", "E10"),
+        ("steel-round-13mm-5x10-large", 50, "A1", "E10"),
+        ("steel-round-16mm-5x10-large", 50, "A1", "E10"),
         ("round-5ml-3x4", 12, "A1", "C4"),
         ("round-10ml-3x4", 12, "A1", "C4"),
         ("quincunx-17mm-8", 8, "A1", "C3"),
@@ -129,7 +131,7 @@ def test_racks_have_their_slots(name: str, count: int, first: str, last: str) ->
 
 
 def test_every_catalogue_rack_is_tested_for_its_slots() -> None:
-    assert len(RACKS) == 8
+    assert len(RACKS) == 10
 
 
 @pytest.mark.parametrize("tube", TUBES, ids=lambda tube: tube.name)
