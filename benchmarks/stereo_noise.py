@@ -111,7 +111,7 @@ def plane_view(camera: StereoCamera, depth_m: float, rng: np.random.Generator) -
     exact = normal[2] * depth_m / (k.rays() @ normal)
     depth = matched_depth_m(camera, exact, np.ones(exact.shape), rng)
     depth = depth + depth_error_m(camera, depth, rng, temporal=False)
-    patches = smooth_field((k.height, k.width), (14.0, 14.0), rng)
+    patches = smooth_field((k.height, k.width), (12.0, 6.0), rng)
     return StereoView(camera, np.zeros((k.height, k.width, 3), np.float32), depth, patches, 0)
 
 

@@ -88,7 +88,7 @@ def test_an_edge_is_a_ramp_of_its_width() -> None:
 def test_openings_narrower_than_the_window_are_filled(diameter_px: int, flat: bool) -> None:
     v, u = np.mgrid[: SHAPE[0], : SHAPE[1]]
     inside = np.hypot(u - 100, v - 60) < diameter_px / 2
-    depth, texture = np.where(inside, 0.58, 0.5), np.where(inside, 0.3, 1.0)
+    depth, texture = np.where(inside, 0.58, 0.5), np.where(inside, 0.5, 1.0)
     middle = matched(depth, camera_of(), texture)[60, 100]
     assert middle == pytest.approx(0.5 if flat else 0.58, abs=1e-3)
 

@@ -132,7 +132,7 @@ def _tube(scene: Scene, tube: PlacedTube, hue: float, saturation: float) -> Iter
         paper = tube.label.albedo
         yield label_mesh(tube.label, model), Surface((paper, paper, paper), 0.05, 10.0)
     roughness = scene.finishes.cap_roughness
-    gloss = 0.05 if roughness is None else 0.1 + 0.4 * (1 - roughness)
+    gloss = 0.05 if roughness is None else 0.05 + 0.25 * (1 - roughness)
     if scene.printed_cap is not None:
         printed = scene.finishes.printed_cap.albedo
         mesh = printed_cap_mesh(scene.printed_cap, model).transformed(tube.T_tube_cap)

@@ -22,7 +22,7 @@ SAMPLES = 9
 """Samples across a window: 81 tell the shares of two surfaces to 5 %."""
 SAME_SURFACE_PX = 0.5
 """Disparities that differ by less are one surface."""
-LEAST_TEXTURE = 0.12
+LEAST_TEXTURE = 0.3
 """Mean texture of a window, 1 for a bright matte surface, below which nothing is matched."""
 SHARE_SPREAD = 0.06
 """Standard deviation of the share that wins a window: edges lie farther out here than there."""

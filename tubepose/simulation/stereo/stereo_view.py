@@ -20,13 +20,13 @@ from tubepose.simulation.stereo.stereo_camera import StereoCamera
 from tubepose.simulation.stereo.waves import depth_error_m, smooth_field
 from tubepose.transforms import FloatArray
 
-HALF_TEXTURE = 0.15
+HALF_TEXTURE = 0.2
 """Light, as a share of the picture's bright parts, at which a surface gives half of the texture of a bright one."""
 GLARE = 4.0
 """Light, as a multiple of the picture's bright parts, at which a highlight gives none."""
 BRIGHT_QUANTILE = 0.9
-PATCH_PX = 14.0
-"""Length of patches without depth."""
+PATCH_PX = (12.0, 6.0)
+"""Lengths along u and v of patches without depth."""
 FLICKER = 0.5
 """Share of the variance of the field that patches are cut from that is new in each frame."""
 TILE_RAYS = 200_000
@@ -62,7 +62,7 @@ class StereoView:
         """Depth (H, W) of one frame in the camera's steps, metres; NaN where nothing is measured."""
         camera = self.camera
         depth = self.depth_m + depth_error_m(camera, self.depth_m, rng, temporal=True)
-        fresh = smooth_field((depth.shape[0], depth.shape[1]), (PATCH_PX, PATCH_PX), rng)
+        fresh = smooth_field((depth.shape[0], depth.shape[1]), PATCH_PX, rng)
         field = np.sqrt(1 - FLICKER) * self.patches + np.sqrt(FLICKER) * fresh
         depth[field > _upper(camera.missing_share)] = np.nan
         return counted_depth_m(camera, depth)
@@ -100,7 +100,7 @@ def stereo_view(scene: Scene, camera: StereoCamera, rng: np.random.Generator, *,
     depth = matched_depth_m(camera, depth, texture_of(radiance), match_rng)
     depth *= scale
     depth += depth_error_m(camera, depth, noise_rng, temporal=False)
-    patches = smooth_field((k.height, k.width), (PATCH_PX, PATCH_PX), patch_rng)
+    patches = smooth_field((k.height, k.width), PATCH_PX, patch_rng)
     return StereoView(camera, radiance, depth, patches, int(render_rng.integers(2**62)))
 
 
@@ -143,7 +143,8 @@ def texture_of(radiance: NDArray[np.float32]) -> FloatArray:
     light = radiance.mean(axis=2)
     bright = max(float(np.quantile(light, BRIGHT_QUANTILE)), 1e-6)
     share = cv2.blur(light / bright, (3, 3)).astype(float)
-    return np.asarray(share / (share + HALF_TEXTURE) * np.clip((GLARE - share) / (0.5 * GLARE), 0, 1) ** 2)
+    lit = share**2 / (share**2 + HALF_TEXTURE**2)
+    return np.asarray(lit * np.clip((GLARE - share) / (0.5 * GLARE), 0, 1) ** 2)
 
 
 def _upper(share: float) -> float:
