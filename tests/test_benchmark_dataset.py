@@ -17,7 +17,16 @@ from tubepose.simulation import read_exact_truth
 
 REPOSITORY = Path(__file__).resolve().parent.parent
 # Of the design, not of the materials: the same in both splits.
-DESIGN = {"rack_bow_mm", "fill", "scanner_tilt_deg", "scattering_per_mm", "liquid_share", "label_share", "tolerances"}
+DESIGN = {
+    "distance_m",
+    "rack_bow_mm",
+    "fill",
+    "scanner_tilt_deg",
+    "scattering_per_mm",
+    "liquid_share",
+    "label_share",
+    "tolerances",
+}
 SMALL = {
     "rack": "round-10ml-3x4",
     "tubes": ["blood-16x100", "chen2023-tube-3"],

@@ -6,6 +6,7 @@ import cv2
 import numpy as np
 import pytest
 import yaml
+from commands import tubepose
 
 from tubepose.capture.source import open_captures
 from tubepose.errors import ConfigError
@@ -288,3 +289,23 @@ def test_unknown_cameras_and_options_that_do_not_fit_are_refused(tmp_path) -> No
         simulate(tmp_path / "s", frames=2)
     with pytest.raises(ConfigError, match="expected 1 to 750"):
         simulate(tmp_path / "s", frames=10_000, capture_format="mcap")
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        (["--sensor", "stereo"], "--sensor stereo needs --camera: d405, d435, d435-640, or a YAML file"),
+        (["--camera", "d405"], "--camera given, but --sensor raycast has no use for it; give --sensor stereo"),
+        (
+            ["--sensor", "stereo", "--camera", "d405", "--resolution", "400"],
+            "the size of a stereo image is its camera's",
+        ),
+        (["--frames", "2", "--format", "folder"], "2 frames do not go into a folder, which holds one"),
+    ],
+)
+def test_options_of_the_command_that_do_not_fit_are_one_line(tmp_path, options, words: str) -> None:
+    ended = tubepose("simulate", tmp_path / "s", "--rack", RACK.name, "--tubes", TUBE.name, "--trials", "1", *options)
+    assert ended.code == 1
+    assert len(ended.errors) == 1
+    assert words in ended.errors[0]
+    assert not (tmp_path / "s").exists()
