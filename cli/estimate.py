@@ -26,7 +26,7 @@ def estimate(
         typer.Argument(
             parser=named,
             metavar="CAPTURES",
-            help="Capture folders, .ply or .mcap files, session folders, or folders of those.",
+            help="Capture folders, .ply, .pcd, .ptx or .mcap files, BOP scenes, session folders, or folders of those.",
         ),
     ],
     out: Annotated[
@@ -62,6 +62,14 @@ def estimate(
         str | None,
         typer.Option(
             help="Unit of the clouds, m or mm; goes before capture.yaml. A bare .ply file is in m without it."
+        ),
+    ] = None,
+    depth_scale: Annotated[
+        float | None,
+        typer.Option(
+            metavar="METRES",
+            help="Metres of one count of depth images: 0.001 for millimetres, 1 for floats in metres; goes before "
+            "what files say.",
         ),
     ] = None,
     cloud_topic: Annotated[str | None, typer.Option(help="Topic of the clouds in an .mcap file.")] = None,
@@ -101,6 +109,7 @@ def estimate(
         no_such_file,
         read_methods,
         read_tubes,
+        refuse_idle_scale,
         refuse_idle_topics,
         refuse_twins,
         sessions_below,
@@ -125,7 +134,15 @@ def estimate(
     for path in captures:
         with kept(None if fail_fast else problems):
             found, unread = capture_jobs(
-                path, choice, tube_models, settings, unit=unit, hints=told, topics=topics, fail_fast=fail_fast
+                path,
+                choice,
+                tube_models,
+                settings,
+                unit=unit,
+                depth_scale_m=depth_scale,
+                hints=told,
+                topics=topics,
+                fail_fast=fail_fast,
             )
             distinct, twins = refuse_twins(found, jobs)
             if twins and fail_fast:
@@ -135,6 +152,7 @@ def estimate(
     if not jobs:
         finish(problems)  # before anything of an earlier run is written over
     refuse_idle_topics(jobs, topics)
+    refuse_idle_scale(jobs, depth_scale)
     with kept(problems if problems and not fail_fast else None):
         refuse_unknown_captures(jobs, told)
     tables = run_estimates(

@@ -21,7 +21,7 @@ ALLOWED: dict[str, set[str]] = {
     "errors": set(),
     "transforms": set(),
     "labware": set(),
-    "capture": {"labware"},
+    "capture": {"compiled", "labware"},
     "config": {"labware"},
     "preprocessing": {"config", "labware"},
     "detection": {"capture", "config", "labware", "preprocessing", "rack"},

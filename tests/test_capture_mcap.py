@@ -286,7 +286,7 @@ def test_a_picture_that_claims_to_be_huge_is_refused_in_one_line(tmp_path):
     frame = jpeg.index(b"\xff\xc0") + 5  # start of frame: height and width
     huge = jpeg[:frame] + b"\xff\xff\xff\xff" + jpeg[frame + 4 :]
     messages = [*clouds([0]), ("/texture", COMPRESSED_IMAGE, header() | {"format": "jpeg", "data": huge})]
-    with pytest.raises(CaptureError, match="cannot be decoded; expected a whole PNG or JPEG"):
+    with pytest.raises(CaptureError, match=r"claims more than [0-9]+ pixels"):
         read_all(record(tmp_path / "a.mcap", messages))
 
 
@@ -386,7 +386,7 @@ WHOLE = ros_inverse_depth(np.full((24, 32), 0.7))
         (FORMAT, WHOLE[:12] + b"nothing", "cannot be decoded; expected a whole PNG"),
         (FORMAT, struct.pack("<iff", 0, np.nan, 0.0) + WHOLE[12:], "A = nan and B = 0; expected numbers with A above"),
         (FORMAT, struct.pack("<iff", 0, 0.0, 0.0) + WHOLE[12:], "A = 0 and B = 0; expected numbers with A above 0"),
-        (FORMAT, raw_depth(np.zeros((24, 32), np.uint8)), "16 bits and 1 channel, found 8 bits"),
+        (FORMAT, raw_depth(np.zeros((24, 32), np.uint8)), "16 bits and 1 channel .*, found 8 bits"),
         (FORMAT, ros_inverse_depth(np.full((12, 16), 0.7)), "depth image is 16 x 12 pixels, its CameraInfo 32 x 24"),
         ("16UC1; compressedDepth rvl", WHOLE, "format '16UC1; compressedDepth rvl' is not read; expected .* as png"),
         ("8UC1; compressedDepth png", WHOLE, "format '8UC1; compressedDepth png' is not read"),

@@ -81,7 +81,7 @@ def decode_compressed_depth(form: str, data: bytes, where: str) -> FloatArray:
             f"{where}: the compressed depth holds {len(data)} bytes, expected a header of {_HEADER.size} bytes and a "
             "PNG after it; record it again"
         )
-    counts = depth_counts(decode(data[_HEADER.size :], where), where)
+    counts = depth_counts(decode(data[_HEADER.size :], where), where).astype(np.uint16, copy=False)
     if known[1].upper() == "16UC1":
         return depth_to_metres(counts, _METRES_PER_COUNT)
     _, a, b = _HEADER.unpack_from(data)

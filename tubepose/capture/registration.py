@@ -51,9 +51,13 @@ def clean_cloud(xyz: ArrayLike, metres_per_unit: float) -> FloatArray:
 
 
 def depth_to_metres(counts: NDArray[np.generic], metres_per_count: float) -> FloatArray:
-    """Depth (H, W) in metres from counts; zero, negative, non-finite and 65535 of 16 bits (overflow) become NaN."""
+    """Depth (H, W) in metres from counts; zero, negative, non-finite and 65535 of 16 bits (overflow) become NaN.
+
+    So does what is farther than `FARTHEST_M`: renderers write 1e10 where nothing is.
+    """
     depth = counts.astype(np.float64) * metres_per_count
-    invalid = ~(np.isfinite(depth) & (depth > 0))
+    with np.errstate(invalid="ignore"):
+        invalid = ~((depth > 0) & (depth < FARTHEST_M))
     if counts.dtype.kind == "u":
         invalid |= counts == np.iinfo(np.uint16).max
     depth[invalid] = np.nan
