@@ -382,7 +382,7 @@ WHOLE = ros_inverse_depth(np.full((24, 32), 0.7))
     [
         (FORMAT, b"", "holds 0 bytes, expected a header of 12 bytes and a PNG"),
         (FORMAT, WHOLE[:12], "holds 12 bytes, expected a header of 12 bytes and a PNG"),
-        (FORMAT, WHOLE[:-8], "truncated; expected a whole PNG"),
+        (FORMAT, WHOLE[:-8], "truncated or damaged; expected a whole PNG"),
         (FORMAT, WHOLE[:12] + b"nothing", "cannot be decoded; expected a whole PNG"),
         (FORMAT, struct.pack("<iff", 0, np.nan, 0.0) + WHOLE[12:], "A = nan and B = 0; expected numbers with A above"),
         (FORMAT, struct.pack("<iff", 0, 0.0, 0.0) + WHOLE[12:], "A = 0 and B = 0; expected numbers with A above 0"),

@@ -40,6 +40,12 @@ class IntrinsicsEntry(BaseModel):
     cx: float
     cy: float
 
+    @model_validator(mode="after")
+    def _check(self) -> IntrinsicsEntry:
+        if fault := self.camera().fault:
+            raise ValueError(fault)
+        return self
+
     def camera(self) -> CameraIntrinsics:
         """The same as the library's type."""
         return CameraIntrinsics(**self.model_dump())

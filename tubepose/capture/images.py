@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import struct
 import warnings
+import zlib
 from pathlib import Path
 
 import cv2
@@ -12,11 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
+from tubepose.capture.frame import MOST_PIXELS
 from tubepose.errors import CaptureError
 
 _PNG = b"\x89PNG"
-MOST_PIXELS = 1 << 26
-"""No camera of racks has more; a file of a few bytes can claim any number."""
 # What a damaged header makes Pillow raise.
 _UNREADABLE = (
     *(OSError, SyntaxError, ValueError, struct.error, IndexError, KeyError, TypeError),
@@ -52,26 +52,38 @@ def _claimed_pixels(data: bytes) -> int:
             return 0
 
 
+def _is_cut_png(data: bytes) -> bool:
+    """Whether a PNG breaks off before its end, or has a chunk of another checksum: libpng would complain on stderr."""
+    at = len(_PNG) + 4
+    while at + 12 <= len(data):
+        length = int.from_bytes(data[at : at + 4], "big")
+        end = at + 8 + length
+        if end + 4 > len(data) or zlib.crc32(data[at + 4 : end]) != int.from_bytes(data[end : end + 4], "big"):
+            return True
+        if data[at + 4 : at + 8] == b"IEND":
+            return False
+        at = end + 4
+    return True
+
+
 def decode(data: bytes, where: str) -> NDArray[np.generic]:
     """Pixels of a PNG, JPEG or TIFF as they are stored, shape (H, W) or (H, W, C), OpenCV's channel order.
 
     Raises:
-        CaptureError: Cut, no image at all, or one of more than `MOST_PIXELS`. A PNG without its end is refused before
-            libpng complains on stderr.
+        CaptureError: Cut, damaged, no image at all, or one of more than `MOST_PIXELS`.
     """
     claimed = _claimed_pixels(data)
     if claimed > MOST_PIXELS:
         raise CaptureError(f"{where}: claims more than {MOST_PIXELS} pixels; expected a camera's picture")
-    cut = data.startswith(_PNG) and b"IEND" not in data
+    cut = data.startswith(_PNG) and _is_cut_png(data)
     flags = cv2.IMREAD_UNCHANGED | cv2.IMREAD_IGNORE_ORIENTATION
     try:
         pixels = None if cut or not claimed else cv2.imdecode(np.frombuffer(data, np.uint8), flags)
     except cv2.error:  # a header that claims more pixels than OpenCV opens
         pixels = None
     if pixels is None:
-        raise CaptureError(
-            f"{where}: {'truncated' if cut else 'cannot be decoded'}; expected a whole PNG, JPEG or TIFF image"
-        )
+        what = "truncated or damaged" if cut else "cannot be decoded"
+        raise CaptureError(f"{where}: {what}; expected a whole PNG, JPEG or TIFF image")
     return np.asarray(pixels)
 
 

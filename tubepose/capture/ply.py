@@ -90,7 +90,8 @@ def read_ply(path: Path) -> CloudFile:
     table = _read_element(path, data, header, at)
     if len(table[properties[0]]) < vertex.count:
         raise _cut(path, vertex.count, len(table[properties[0]]))
-    xyz = np.stack([table[axis].astype(np.float64) for axis in "xyz"], axis=1)
+    with np.errstate(invalid="ignore"):  # signalling NaN
+        xyz = np.stack([table[axis].astype(np.float64) for axis in "xyz"], axis=1)
     return CloudFile(xyz, colours_of(table), _size(path, data, header, vertex.count), header.unit)
 
 

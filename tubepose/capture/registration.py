@@ -43,7 +43,7 @@ def clean_cloud(xyz: ArrayLike, metres_per_unit: float) -> FloatArray:
         metres_per_unit: 1 for metres, 0.001 for millimetres.
     """
     points = np.array(xyz, dtype=np.float64)
-    with np.errstate(invalid="ignore"):  # NaN is no distance either
+    with np.errstate(invalid="ignore", over="ignore"):  # NaN is no distance either
         invalid = ~(np.abs(points) * metres_per_unit < FARTHEST_M).all(axis=-1) | (points == 0).all(axis=-1)
     points *= metres_per_unit
     points[invalid] = np.nan
@@ -55,8 +55,8 @@ def depth_to_metres(counts: NDArray[np.generic], metres_per_count: float) -> Flo
 
     So does what is farther than `FARTHEST_M`: renderers write 1e10 where nothing is.
     """
-    depth = counts.astype(np.float64) * metres_per_count
-    with np.errstate(invalid="ignore"):
+    with np.errstate(invalid="ignore", over="ignore"):
+        depth = counts.astype(np.float64) * metres_per_count
         invalid = ~((depth > 0) & (depth < FARTHEST_M))
     if counts.dtype.kind == "u":
         invalid |= counts == np.iinfo(np.uint16).max

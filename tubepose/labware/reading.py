@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import difflib
 import hashlib
+import sys
 from collections.abc import Iterable, Sequence
 from functools import cache
 from importlib.resources import files
@@ -23,6 +24,17 @@ _M = TypeVar("_M", bound=BaseModel)
 _L = TypeVar("_L", RackModel, TubeModel, CapModel)
 
 
+_LONGEST_QUOTE = 200
+"""Characters of a wrong value that are told."""
+_MOST_VALUES = 200_000
+"""In a file: thousands of times what a rack of a thousand slots has."""
+# What PyYAML raises for values that are not what their tag says, and for depths that are none.
+_NO_YAML = (
+    *(yaml.YAMLError, ValueError, OverflowError, RecursionError),
+    *(AttributeError, TypeError, KeyError, IndexError),
+)
+
+
 class _Loader(yaml.SafeLoader):
     """Of two values for one key YAML keeps the last one, and so loses what was meant: refused instead."""
 
@@ -39,6 +51,26 @@ class _Loader(yaml.SafeLoader):
             seen.add((key.tag, key.value))
         return node
 
+    def get_single_node(self) -> yaml.Node | None:
+        """The whole document, unless its aliases stand for more than anybody writes (a "billion laughs" file)."""
+        node = super().get_single_node()
+        most = max(_MOST_VALUES, self.index)  # characters: there is no value without one
+        if node is not None and _expanded(node, {}) > most:
+            told = f"its aliases stand for more than {most} values"
+            raise yaml.composer.ComposerError(None, None, told, node.start_mark)
+        return node
+
+
+def _expanded(node: yaml.Node, known: dict[int, int]) -> int:
+    """Values that a node stands for, what its aliases repeat counted each time; of a circle more than are allowed."""
+    if isinstance(node, yaml.ScalarNode):
+        return 1
+    if id(node) not in known:
+        known[id(node)] = sys.maxsize  # until it is counted: it holds itself
+        parts = [part for pair in node.value for part in pair] if isinstance(node, yaml.MappingNode) else node.value
+        known[id(node)] = 1 + sum(_expanded(part, known) for part in parts)
+    return known[id(node)]
+
 
 def labware_sha256(item: Labware) -> str:
     """SHA-256 of a definition's content, wherever it was read from."""
@@ -53,8 +85,9 @@ def read_yaml(path: Path, error: type[TubePoseError]) -> dict[str, Any]:
         raise error(f"{path}: no such file") from None
     except (OSError, UnicodeDecodeError) as problem:
         raise error(f"{path}: cannot be read: {problem}") from None
-    except (yaml.YAMLError, ValueError, OverflowError, RecursionError) as problem:  # dates and depths that are none
-        raise error(f"{path}: not valid YAML: {problem}") from None
+    except _NO_YAML as problem:
+        told = problem if isinstance(problem, yaml.YAMLError | ValueError) else "a value is not what its tag says"
+        raise error(f"{path}: not valid YAML: {told}") from None
     if not isinstance(data, dict):
         found = "nothing: the file is empty" if data is None else f"a {type(data).__name__}"
         raise error(f"{path}: expected a mapping of keys to values, found {found}")
@@ -78,12 +111,14 @@ def _explain(model: type[BaseModel], entry: Any) -> str:
     if entry["type"] == "missing":
         return f"the key '{place}' is missing"
     if entry["type"] == "tuple_type":
-        return f"{place}: expected a list in brackets, [..., ...] (found {entry['input']!r})"
+        return f"{place}: expected a list in brackets, [..., ...] (found {repr(entry['input'])[:_LONGEST_QUOTE]})"
     message = entry["msg"].removeprefix("Value error, ")
     message = f"{place}: {message}" if place else message
     given = entry["input"]
     return (
-        message if isinstance(given, dict | list) or entry["type"] == "value_error" else f"{message} (found {given!r})"
+        message
+        if isinstance(given, dict | list) or entry["type"] == "value_error"
+        else f"{message} (found {repr(given)[:_LONGEST_QUOTE]})"
     )
 
 

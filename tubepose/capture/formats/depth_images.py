@@ -2,15 +2,27 @@
 
 from __future__ import annotations
 
+import io
+import os
+import tokenize
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager, redirect_stdout
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from tubepose.capture.images import MOST_PIXELS, decode, depth_counts, read_bytes
+from tubepose.capture.frame import MOST_PIXELS
+from tubepose.capture.images import decode, depth_counts, read_bytes
 from tubepose.errors import CaptureError
 
 DEPTH_SUFFIXES = (".png", ".tiff", ".tif", ".exr", ".npy")
+# What NumPy's reader raises for a damaged header.
+_NO_ARRAY = (
+    *(ValueError, OSError, EOFError, SyntaxError, TypeError, OverflowError, RecursionError, MemoryError, Warning),
+    *(tokenize.TokenError, KeyError, IndexError, AttributeError),
+)
 _NPY, _EXR = b"\x93NUMPY", b"\x76\x2f\x31\x01"
 _DEPTH_CHANNELS = ("z", "depth", "distance", "y", "v", "r")
 """Names that renderers give the channel of an EXR with the depth in it, without layers, best first."""
@@ -51,25 +63,41 @@ def _checked(depth: NDArray[np.generic], path: Path) -> NDArray[np.generic]:
 
 def _read_npy(path: Path) -> NDArray[np.generic]:
     try:
-        # Mapped, so that nothing is taken for an array that is larger than its file.
-        mapped = np.load(path, mmap_mode="r", allow_pickle=False)
-        # A copy in the machine's byte order.
-        return np.array(mapped, dtype=mapped.dtype.newbyteorder("="))
-    except (ValueError, OSError, EOFError, SyntaxError, TypeError, OverflowError, RecursionError, MemoryError):
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")  # NumPy warns of damaged headers that it can still make something of
+            # Mapped, so that nothing is taken for an array that is larger than its file.
+            mapped = np.load(path, mmap_mode="r", allow_pickle=False)
+            # A copy in the machine's byte order.
+            return np.array(mapped, dtype=mapped.dtype.newbyteorder("="))
+    except _NO_ARRAY:
         raise CaptureError(
             f"{path}: truncated or damaged; expected a whole .npy file of one array of numbers"
         ) from None
+
+
+@contextmanager
+def _silence() -> Iterator[None]:
+    """Nothing of this process reaches stderr inside, or is printed: OpenEXR does both with what it raises as well."""
+    kept, nowhere = os.dup(2), os.open(os.devnull, os.O_WRONLY)
+    try:
+        os.dup2(nowhere, 2)
+        with redirect_stdout(io.StringIO()):
+            yield
+    finally:
+        os.dup2(kept, 2)
+        os.close(kept)
+        os.close(nowhere)
 
 
 def _read_exr(path: Path) -> NDArray[np.generic]:
     import OpenEXR
 
     try:
-        with OpenEXR.File(str(path), separate_channels=True, header_only=True) as file:
+        with _silence(), OpenEXR.File(str(path), separate_channels=True, header_only=True) as file:
             (left, top), (right, bottom) = file.header()["dataWindow"]
         if (int(right) - int(left) + 1) * (int(bottom) - int(top) + 1) > MOST_PIXELS:
             raise CaptureError(f"{path}: claims more than {MOST_PIXELS} pixels; expected a depth image of a camera")
-        with OpenEXR.File(str(path), separate_channels=True) as file:
+        with _silence(), OpenEXR.File(str(path), separate_channels=True) as file:
             channels = {name: np.array(channel.pixels) for name, channel in file.channels().items()}
     except (RuntimeError, ValueError, OSError, KeyError, TypeError, IndexError, MemoryError):
         raise CaptureError(f"{path}: truncated or damaged; expected a whole OpenEXR file") from None

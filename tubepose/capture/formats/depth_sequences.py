@@ -118,6 +118,8 @@ def _read_view(view: DepthView, name: str, given: GivenScale, hint: str) -> Rgbd
         )
     (fx, _, cx), (_, fy, cy) = view.K[:2].tolist()
     camera = CameraIntrinsics(width, height, fx, fy, cx, cy)
+    if camera.fault:
+        raise CaptureError(f"{view.depth}: its camera has {camera.fault}")
     return RgbdFrame(
         cloud_m=camera.backproject(depth_to_metres(counts, scale)),
         image=image,

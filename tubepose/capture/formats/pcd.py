@@ -55,7 +55,8 @@ def read_pcd(path: Path) -> CloudFile:
     missing = [axis for axis in "xyz" if axis not in columns]
     if missing:
         raise CaptureError(f"{path}: expected the fields x, y and z, found {', '.join(columns) or 'none'}")
-    xyz = np.stack([columns[axis].astype(np.float64) for axis in "xyz"], axis=1)
+    with np.errstate(invalid="ignore"):  # signalling NaN
+        xyz = np.stack([columns[axis].astype(np.float64) for axis in "xyz"], axis=1)
     packed = next((columns[name] for name in ("rgb", "rgba") if name in columns), None)
     colours = colours_of(columns) if packed is None else packed_colours(_as_bits(packed))
     # One row is how a cloud without pixels is written.
