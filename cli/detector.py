@@ -259,6 +259,7 @@ def read_labware_list(names: str) -> Stock:
     """Racks, tubes and printed caps of a comma-separated list of names and files, or of the whole catalogue."""
     from tubepose.errors import LabwareError
     from tubepose.labware import CapModel, RackModel, TubeModel, catalogue, read_labware
+    from tubepose.labware.reading import LABWARE_SUFFIXES
     from tubepose.training.scenes import Stock
     from tubepose_cli.inputs import unknown_name
 
@@ -269,10 +270,10 @@ def read_labware_list(names: str) -> Stock:
             found += known.values()
         elif name in known:
             found.append(known[name])
-        elif Path(name).suffix in (".yaml", ".yml"):
+        elif Path(name).suffix in LABWARE_SUFFIXES:
             found.append(read_labware(Path(name)))
         elif name:
-            raise LabwareError(unknown_name("labware", name, known) + "; or give a .yaml file")
+            raise LabwareError(unknown_name("labware", name, known) + "; or give a .yaml or .json file")
     racks = tuple(item for item in found if isinstance(item, RackModel))
     tubes = tuple(item for item in found if isinstance(item, TubeModel))
     caps = tuple(item for item in found if isinstance(item, CapModel))

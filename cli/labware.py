@@ -77,15 +77,18 @@ def _find(name_or_file: str) -> Labware:
 
     from tubepose.errors import LabwareError
     from tubepose.labware import catalogue, read_labware
+    from tubepose.labware.reading import LABWARE_SUFFIXES
 
     known = catalogue()
     if name_or_file in known:
         return known[name_or_file]
-    if Path(name_or_file).suffix in (".yaml", ".yml"):
+    if Path(name_or_file).suffix in LABWARE_SUFFIXES:
         return read_labware(Path(name_or_file))
     close = difflib.get_close_matches(name_or_file, known, n=1)
     guess = f"; did you mean '{close[0]}'?" if close else ";"
-    raise LabwareError(f"unknown labware '{name_or_file}'{guess} see 'tubepose labware list', or give a .yaml file")
+    raise LabwareError(
+        f"unknown labware '{name_or_file}'{guess} see 'tubepose labware list', or give a .yaml or .json file"
+    )
 
 
 def _print(table: Table) -> None:

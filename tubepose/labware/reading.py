@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import difflib
 import hashlib
+import json
 import sys
 from collections.abc import Iterable, Sequence
 from functools import cache
@@ -15,6 +16,7 @@ import yaml
 from pydantic import BaseModel, ValidationError
 
 from tubepose.errors import LabwareError, TubePoseError
+from tubepose.labware.other_standards import SIDE_SUFFIX, SideFile, complete_rack, read_foreign_rack, side_words
 from tubepose.labware.racks import RackModel
 from tubepose.labware.tubes import CapModel, TubeModel
 
@@ -24,6 +26,8 @@ _M = TypeVar("_M", bound=BaseModel)
 _L = TypeVar("_L", RackModel, TubeModel, CapModel)
 
 
+LABWARE_SUFFIXES = (".yaml", ".yml", ".json")
+"""Ends of the names of definition files: our own, and JSON of other standards."""
 _LONGEST_QUOTE = 200
 """Characters of a wrong value that are told."""
 _MOST_VALUES = 200_000
@@ -143,12 +147,43 @@ def _types_in(annotation: Any) -> list[Any]:
     return [annotation] if not arguments else [t for argument in arguments for t in _types_in(argument)]
 
 
+def read_json(path: Path, error: type[TubePoseError]) -> dict[str, Any]:
+    """Read one JSON object; raises `error` in one line if the file is missing, broken or no object."""
+    try:
+        data = json.loads(path.read_text(encoding="utf-8-sig"))
+    except FileNotFoundError:
+        raise error(f"{path}: no such file") from None
+    except (OSError, UnicodeDecodeError) as problem:
+        raise error(f"{path}: cannot be read: {problem}") from None
+    except (ValueError, RecursionError) as problem:
+        raise error(f"{path}: not valid JSON: {problem}") from None
+    if not isinstance(data, dict):
+        raise error(f"{path}: expected a JSON object, found a {type(data).__name__}")
+    return data
+
+
+def read_rack_json(path: Path) -> RackModel:
+    """A rack of another standard, completed by its side file: `my_rack.json` by `my_rack.side.yaml`.
+
+    Raises:
+        LabwareError: No standard that is read, a side file that is missing or wrong, or a rack that cannot be.
+    """
+    rack = read_foreign_rack(read_json(path, LabwareError), str(path))
+    side = path.with_name(path.stem + SIDE_SUFFIX)
+    if not side.is_file():
+        raise LabwareError(f"{path}: {side_words(rack, str(side))}")
+    added = validate(SideFile, read_yaml(side, LabwareError), str(side), LabwareError)
+    return validate(RackModel, complete_rack(rack, added, str(side)), f"{path} with {side.name}", LabwareError)
+
+
 def read_labware(path: Path) -> Labware:
-    """Read one definition file.
+    """Read one definition file: our own YAML, or JSON of another standard with its side file.
 
     Raises:
         LabwareError: The file is missing, is no YAML mapping, or breaks its model; one line that names the key.
     """
+    if path.suffix.lower() == ".json":
+        return read_rack_json(path)
     data = read_yaml(path, LabwareError)
     kind = data.get("kind")
     if not isinstance(kind, str) or kind not in _KINDS:
@@ -169,14 +204,16 @@ def _load(name_or_file: str, model: type[_L], kind: str, folder: Path | None) ->
     if name_or_file in known:
         return known[name_or_file]
     path = Path(name_or_file)
-    if path.suffix in (".yaml", ".yml"):
+    if path.suffix in LABWARE_SUFFIXES:
         item = read_labware(folder / path if folder is not None else path)
         if not isinstance(item, model):
             raise LabwareError(f"{path}: expected a {kind}, found a {item.kind}")
         return item
     close = difflib.get_close_matches(name_or_file, known, n=1)
     guess = f"; did you mean '{close[0]}'?" if close else ""
-    raise LabwareError(f"unknown {kind} '{name_or_file}'{guess}; known: {', '.join(known)}; or give a .yaml file")
+    raise LabwareError(
+        f"unknown {kind} '{name_or_file}'{guess}; known: {', '.join(known)}; or give a .yaml or .json file"
+    )
 
 
 def load_rack(name_or_file: str, folder: Path | None = None) -> RackModel:

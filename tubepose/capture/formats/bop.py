@@ -8,10 +8,10 @@ from pathlib import Path
 
 from tubepose.capture.formats.depth_images import DEPTH_SUFFIXES
 from tubepose.capture.formats.depth_sequences import DepthView, GivenScale, camera_matrix, read_views
-from tubepose.capture.formats.json_files import read_json
 from tubepose.capture.formats.text_numbers import whole_number
 from tubepose.capture.frame import RgbdFrame
 from tubepose.errors import CaptureError
+from tubepose.labware.reading import read_json
 
 CAMERA_FILES = "scene_camera*.json"
 _PREFIX = "scene_camera"
@@ -58,7 +58,7 @@ class BopScene:
         file = cameras[0]
         sensor = file.stem.removeprefix(_PREFIX)
         views, problems = [], []
-        for key, entry in sorted(read_json(file).items(), key=lambda item: (len(item[0]), item[0])):
+        for key, entry in sorted(read_json(file, CaptureError).items(), key=lambda item: (len(item[0]), item[0])):
             try:
                 views.append(_view(file, sensor, key, entry))
             except CaptureError as problem:

@@ -13,11 +13,11 @@ from pathlib import Path
 
 from tubepose.capture.formats.depth_images import DEPTH_SUFFIXES
 from tubepose.capture.formats.depth_sequences import DepthView, GivenScale, camera_matrix, read_views
-from tubepose.capture.formats.json_files import read_json
 from tubepose.capture.formats.text_numbers import read_numbers
 from tubepose.capture.frame import RgbdFrame
 from tubepose.capture.images import read_bytes
 from tubepose.errors import CaptureError
+from tubepose.labware.reading import read_json
 from tubepose.transforms import FloatArray
 
 _DEPTH = "depth"
@@ -78,7 +78,7 @@ class DepthFolder:
 
 def _open3d_camera(file: Path) -> tuple[FloatArray, tuple[int, int] | None, float | None]:
     """Camera matrix, size and metres per count of an `intrinsic.json`."""
-    data = read_json(file)
+    data = read_json(file, CaptureError)
     if "intrinsic_matrix" not in data:
         raise CaptureError(
             f"{file}: expected Open3D's keys width, height and intrinsic_matrix, found "
