@@ -94,7 +94,8 @@ def train(
     images: Annotated[
         list[Path] | None,
         typer.Option(
-            help="Learn from this set (images/, labels/, classes.txt) and render none; several: give it again."
+            help="Learn from this set (images/, labels/, classes.txt; a data.yaml) and render none; "
+            "several: give it again."
         ),
     ] = None,
     start: Annotated[
@@ -180,9 +181,9 @@ def evaluate(
     import cv2
     import pandas as pd
 
-    from tubepose.detection.box_files import read_class_names
     from tubepose.detection.bundled import bundled_model
     from tubepose.detection.evaluation import evaluate_detector, kinds_of
+    from tubepose.detection.label_formats import read_class_names
     from tubepose.detection.labelled_images import find_labelled
     from tubepose.detection.yolo import YoloDetector
     from tubepose.report import write_aside, write_csv

@@ -231,9 +231,9 @@ def make_detector(
         return lambda rack, tubes: GeometricDetector(rack, tubes, config)
     if name == "yolo":
         from tubepose.detection.assisted import AssistedDetector
-        from tubepose.detection.box_files import read_class_names
         from tubepose.detection.bundled import bundled_model
         from tubepose.detection.geometric import GeometricDetector
+        from tubepose.detection.label_formats import read_class_names
         from tubepose.detection.yolo import YoloDetector
 
         names = read_class_names(classes) if classes is not None else None
