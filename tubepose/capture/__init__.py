@@ -5,8 +5,8 @@ from tubepose.capture.formats.bop import BopScene
 from tubepose.capture.formats.cloud_files import CloudFileCapture
 from tubepose.capture.formats.depth_folders import DepthFolder
 from tubepose.capture.frame import CameraIntrinsics, RgbdFrame
-from tubepose.capture.mcap import McapCapture
 from tubepose.capture.mcap_writing import write_mcap
+from tubepose.capture.recorded import RecordedCapture
 from tubepose.capture.registration import estimate_intrinsics, project_cloud
 from tubepose.capture.source import Capture, open_captures
 from tubepose.capture.writing import write_folder_capture
@@ -18,7 +18,7 @@ __all__ = [
     "CloudFileCapture",
     "DepthFolder",
     "FolderCapture",
-    "McapCapture",
+    "RecordedCapture",
     "RgbdFrame",
     "estimate_intrinsics",
     "open_captures",

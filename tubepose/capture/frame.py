@@ -83,6 +83,7 @@ class RgbdFrame:
         organised: Whether neighbouring pixels are neighbours in space.
         sensor: What recorded it, as far as is known.
         simulated: True when the capture says that it is simulated.
+        notes: What was passed over or taken for granted when it was read, in words.
     """
 
     cloud_m: FloatArray
@@ -94,6 +95,7 @@ class RgbdFrame:
     organised: bool = True
     sensor: str = "unknown"
     simulated: bool = False
+    notes: tuple[str, ...] = ()
 
     @property
     def points_m(self) -> FloatArray:

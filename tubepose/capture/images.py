@@ -123,6 +123,12 @@ def depth_counts(counts: NDArray[np.generic], where: str) -> NDArray[np.generic]
     return counts
 
 
+def is_depth_png(data: bytes | NDArray[np.uint8]) -> bool:
+    """Whether an encoded image is a PNG of 16 bits and one channel, by its header (PNG specification, IHDR)."""
+    start = bytes(data[:26])
+    return start.startswith(_PNG) and len(start) == 26 and (start[24], start[25]) == (16, 0)
+
+
 def encode_png(pixels: NDArray[np.uint8] | NDArray[np.uint16]) -> bytes:
     """PNG of a gray (H, W) or RGB (H, W, 3) picture, or of 16-bit depth; the same pixels give the same bytes."""
     return _encode(".png", pixels, [cv2.IMWRITE_PNG_COMPRESSION, 6])

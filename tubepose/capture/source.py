@@ -2,21 +2,24 @@
 
 from __future__ import annotations
 
+import math
 import os
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal, Protocol
+from typing import Literal, Protocol, TypedDict, Unpack
 
 from tubepose.capture.description import CAPTURE_FILE, Unit, is_depth_scale
 from tubepose.capture.folder import FolderCapture, is_capture_folder, is_remains
 from tubepose.capture.formats.bop import BopScene, bop_cameras, is_bop_camera
+from tubepose.capture.formats.containers import SUFFIXES, is_recording, recording_suffix
 from tubepose.capture.formats.cloud_files import CLOUD_READERS, CloudFileCapture
 from tubepose.capture.formats.depth_folders import DepthFolder, is_depth_folder
 from tubepose.capture.formats.depth_images import DEPTH_SUFFIXES
 from tubepose.capture.formats.depth_sequences import GivenScale
 from tubepose.capture.frame import RgbdFrame
-from tubepose.capture.mcap import McapCapture
+from tubepose.capture.pairing import PAIRING_TOLERANCE_NS
+from tubepose.capture.recorded import RecordedCapture
 from tubepose.capture.topics import TopicChoice
 from tubepose.errors import CaptureError
 
@@ -24,9 +27,6 @@ from tubepose.errors import CaptureError
 TRUTH_FOLDER = "simulation_truth"
 
 _CONVERT = {
-    ".bag": "a ROS 1 bag; convert it: pip install rosbags, then rosbags-convert, then ros2 bag convert to MCAP "
-    "(or 'mcap convert in.bag out.mcap'); a RealSense .bag: rs-convert -p for PLY",
-    ".db3": "a ROS 2 bag in SQLite; convert it with 'mcap convert in.db3 out.mcap' or 'ros2 bag convert'",
     ".zdf": "a Zivid frame; save it as PLY in Zivid Studio, or frame.save('cloud.ply') with the Zivid SDK (unit: mm)",
     ".praw": "a PhoXi raw frame; open it in PhoXi Control and save it as PLY, organised, with texture (unit: mm)",
 }
@@ -83,40 +83,56 @@ class UnreadableCapture:
         yield
 
 
+class TopicNames(TypedDict, total=False):
+    """Topics of recordings, where several would fit.
+
+    Attributes:
+        cloud_topic: PointCloud2 topic.
+        image_topic: Image or CompressedImage topic.
+        depth_topic: Topic of depth images.
+        info_topic: CameraInfo topic.
+    """
+
+    cloud_topic: str | None
+    image_topic: str | None
+    depth_topic: str | None
+    info_topic: str | None
+
+
 def open_captures(
     path: Path,
     *,
     name: str | None = None,
     unit: str | None = None,
     depth_scale_m: float | None = None,
-    cloud_topic: str | None = None,
-    image_topic: str | None = None,
-    depth_topic: str | None = None,
-    info_topic: str | None = None,
+    max_stamp_difference_ms: float | None = None,
+    **topics: Unpack[TopicNames],
 ) -> list[Capture]:
     """Find the captures at a path; nothing of their content is read yet.
 
     Args:
-        path: A capture folder, a cloud file, an MCAP file, a folder of depth images in the layout of BOP, Open3D or
-            FoundationPose, or a directory that is searched for them, in sorted order.
+        path: A capture folder, a cloud file, a recording (MCAP, ROS 2 SQLite, ROS 1 bag, or the folder of a split one),
+            a folder of depth images in the layout of BOP, Open3D or FoundationPose, or a directory that is searched for
+            them, in sorted order.
         name: Of a single capture; by default it is named after its folder or file.
         unit: ``m`` or ``mm``, unit of clouds: goes before `capture.yaml`; without either a cloud is in metres. ``mm``
-            is the unit of a depth image's counts too where no `depth_scale_m` is given; in recordings they keep theirs.
+            is the unit of a depth image's counts too where no `depth_scale_m` is given, and in recordings that of depth
+            in floats.
         depth_scale_m: Metres per count of depth images, 1 for floats that are metres; it goes before what files say.
-        cloud_topic: PointCloud2 topic of MCAP files.
-        image_topic: Image or CompressedImage topic of MCAP files.
-        depth_topic: Topic of depth images of MCAP files.
-        info_topic: CameraInfo topic of MCAP files.
+        max_stamp_difference_ms: Stamps of a picture and its cloud in a recording differ by no more; 50 by default.
+        **topics: Of recordings, where several would fit; see `TopicNames`.
 
     Returns:
         Captures in sorted order; those of a directory are named by their path in it.
 
     Raises:
-        CaptureError: No such path, nothing to open there, or a unit or scale that is none.
+        CaptureError: No such path, nothing to open there, or a unit, scale or difference that is none.
     """
-    opener = _Opener(
-        GivenScale(_unit(unit), _scale(depth_scale_m)), TopicChoice(cloud_topic, image_topic, depth_topic, info_topic)
+    choice = TopicChoice(
+        topics.get("cloud_topic"), topics.get("image_topic"), topics.get("depth_topic"), topics.get("info_topic")
     )
+    given = GivenScale(_unit(unit), _scale(depth_scale_m))
+    opener = _Opener(given, choice, _difference_ns(max_stamp_difference_ms))
     if not path.exists():
         raise CaptureError(f"{path}: no such file or folder")
     if path.is_file() or _is_closed(path) or _is_capture(path):
@@ -131,17 +147,20 @@ def open_captures(
 class _Opener:
     given: GivenScale
     topics: TopicChoice
+    max_stamp_difference_ns: int
 
     def open(self, path: Path, name: str) -> Capture | None:
         if _is_closed(path):
             return UnreadableCapture(name, path, "may not be read by this user; change its permissions")
+        if is_recording(path):
+            return RecordedCapture(
+                name, path, self.given.unit, self.topics, self.given.depth_scale_m, self.max_stamp_difference_ns
+            )
         if path.is_dir():
             return self._open_folder(path, name)
         suffix = path.suffix.lower()
         if suffix in CLOUD_READERS:
             return CloudFileCapture(name, path, self.given.unit)
-        if suffix == ".mcap":
-            return McapCapture(name, path, self.given.unit, self.topics)
         if is_bop_camera(path):
             return BopScene(name, path, self.given)
         return UnreadableCapture(name, path, _CONVERT[suffix]) if suffix in _CONVERT else None
@@ -157,7 +176,7 @@ class _Opener:
 
 def _is_capture(path: Path) -> bool:
     """True for a folder that is one capture, whatever its layout."""
-    return is_capture_folder(path) or (path.is_dir() and (bool(bop_cameras(path)) or is_depth_folder(path)))
+    return is_recording(path) or is_capture_folder(path) or (path.is_dir() and (bool(bop_cameras(path)) or is_depth_folder(path)))
 
 
 def _unknown_words(path: Path) -> str:
@@ -168,7 +187,8 @@ def _unknown_words(path: Path) -> str:
             f"{CAPTURE_FILE} with 'unit: mm' (or depth_scale_m) and "
             "'intrinsics: {width: , height: , fx: , fy: , cx: , cy: }', and give that folder"
         )
-    return f"expected a capture folder, or a file ending in {', '.join(CLOUD_READERS)} or .mcap, found '{path.suffix}'"
+    known = ", ".join((*CLOUD_READERS, *SUFFIXES))
+    return f"expected a capture folder, or a file ending in {known}, found '{path.suffix}'"
 
 
 def _is_closed(path: Path) -> bool:
@@ -184,8 +204,8 @@ def _search(path: Path, opener: _Opener) -> list[Capture]:
     if not captures:
         raise CaptureError(
             f"{path}: no capture found; looked in it and below for folders with capture.yaml, cloud.ply or depth.png, "
-            f"for BOP scenes, for folders with depth/ and a camera file, and for {', '.join(CLOUD_READERS)} and .mcap "
-            "files; docs/capture-format.md shows how to record one"
+            f"for BOP scenes, for folders with depth/ and a camera file, and for files ending in "
+            f"{', '.join((*CLOUD_READERS, *SUFFIXES))}; docs/capture-format.md shows how to record one"
         )
     return captures
 
@@ -204,6 +224,14 @@ def _scale(depth_scale_m: float | None) -> float | None:
             "1 for floats that are metres"
         )
     return depth_scale_m
+
+
+def _difference_ns(difference_ms: float | None) -> int:
+    if difference_ms is None:
+        return PAIRING_TOLERANCE_NS
+    if not (math.isfinite(difference_ms) and difference_ms >= 0):
+        raise CaptureError(f"a largest difference of stamps of {difference_ms:g} ms is none; expected 0 or more")
+    return round(difference_ms * 1e6)
 
 
 def _sensors(place: Path) -> list[Path]:
@@ -234,7 +262,7 @@ def _walk(folder: Path, inside: frozenset[Path] = frozenset()) -> Iterator[Path]
 
 
 def _is_known(path: Path) -> bool:
-    return path.suffix.lower() in (*CLOUD_READERS, ".mcap", *_CONVERT)
+    return path.suffix.lower() in (*CLOUD_READERS, *_CONVERT) or recording_suffix(path) in SUFFIXES
 
 
 def _names(root: Path, places: list[Path]) -> list[str]:

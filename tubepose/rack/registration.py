@@ -93,7 +93,7 @@ def _unit_suspicion(points_m: FloatArray, rack: RackModel, config: Config, metho
             size = f"{factor:g} times larger" if factor > 1 else f"{1 / factor:g} times smaller"
             return (
                 f"a rack of this shape is there, but {size} than {rack.name} ({outline_words(rack)} mm): "
-                f"is the unit{' (m or mm)' if max(factor, 1 / factor) > 100 else ' or depth_scale_m'} of the capture "
-                "declared right (--unit)?"
+                "is the unit of the capture declared right (--unit m or mm; --depth-scale, metres per count, of depth "
+                f"images: {1 / factor:g} times that of now)?"
             )
     return ""

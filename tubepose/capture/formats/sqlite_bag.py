@@ -1,0 +1,65 @@
+"""ROS 2 bags in SQLite (`.db3`), as `ros2 bag record` of Humble and the RealSense SDK since 2.58 write them.
+
+The messages are read in the order in which they were stored, without the index of times: it lies behind the break of a
+cut file.
+"""
+
+from __future__ import annotations
+
+import sqlite3
+from collections.abc import Iterator
+from pathlib import Path
+from urllib.parse import quote
+
+from tubepose.capture.formats.raw_messages import BrokenRecordingError, RawMessage, inflate
+from tubepose.errors import CaptureError
+
+MAGIC = b"SQLite format 3\x00"
+
+
+def read_sqlite_bag(path: Path, shown: Path) -> Iterator[RawMessage]:
+    """Read the messages of a bag in the order in which they were stored.
+
+    Args:
+        path: The file.
+        shown: What error messages call it.
+
+    Raises:
+        CaptureError: A database that is no ROS 2 bag.
+        BrokenRecordingError: The file is cut or damaged; all before was whole.
+    """
+    try:
+        # A bag that was not closed has its last messages in a log beside it, which only a changeable database has.
+        log = path.with_name(f"{path.name}-wal")
+        changing = log.is_file() and log.stat().st_size > 0
+        connection = _open(path, "mode=ro" if changing else "mode=ro&immutable=1")
+    except sqlite3.Error as problem:
+        raise BrokenRecordingError(str(problem), cut=False) from None
+    try:
+        yield from _messages(connection, shown)
+    except (sqlite3.Error, OverflowError) as problem:
+        raise BrokenRecordingError(str(problem), cut="malformed" in str(problem)) from None
+    finally:
+        connection.close()
+
+
+def _open(path: Path, options: str) -> sqlite3.Connection:
+    return sqlite3.connect(f"file:{quote(str(path.resolve()))}?{options}", uri=True)
+
+
+def _messages(connection: sqlite3.Connection, shown: Path) -> Iterator[RawMessage]:
+    tables = {str(name) for (name,) in connection.execute("SELECT name FROM sqlite_master WHERE type = 'table'")}
+    if not {"topics", "messages"} <= tables:
+        raise CaptureError(
+            f"{shown}: an SQLite database, but no ROS 2 bag: expected the tables topics and messages, found "
+            f"{', '.join(sorted(tables)) or 'none'}"
+        )
+    topics = {
+        row[0]: (str(row[1]), str(row[2]), str(row[3]))
+        for row in connection.execute("SELECT id, name, type, serialization_format FROM topics")
+    }
+    for topic_id, stamp_ns, data in connection.execute("SELECT topic_id, timestamp, data FROM messages ORDER BY id"):
+        if topic_id not in topics or not isinstance(data, bytes) or not isinstance(stamp_ns, int):
+            raise BrokenRecordingError(f"a message of the unknown topic {topic_id}, or without data", cut=False)
+        name, schema, encoding = topics[topic_id]
+        yield RawMessage(name, schema, encoding, b"", inflate(data), stamp_ns)
