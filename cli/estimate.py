@@ -26,8 +26,8 @@ def estimate(
         typer.Argument(
             parser=named,
             metavar="CAPTURES",
-            help="Capture folders, .ply, .pcd, .ptx, .mcap, .db3 or .bag files, BOP scenes, session folders, or folders of "
-            "those.",
+            help="Capture folders, .ply, .pcd, .ptx, .mcap, .db3 or .bag files, BOP scenes, session folders, or "
+            "folders of those.",
         ),
     ],
     out: Annotated[
@@ -79,7 +79,7 @@ def estimate(
     info_topic: Annotated[str | None, typer.Option(help="Topic of the CameraInfo in a recording.")] = None,
     max_stamp_difference: Annotated[
         float | None,
-        typer.Option(metavar="MS", help="Stamps of a picture and its point cloud in a recording differ by no more; 50."),
+        typer.Option(metavar="MS", help="Stamps of picture and cloud in a recording differ by no more; default: 50."),
     ] = None,
     hint: Annotated[
         list[str] | None,

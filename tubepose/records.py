@@ -30,7 +30,8 @@ RACK_COLUMNS = (
     "session", "trial", "capture", "frame", "timestamp_ns", "method", "rack", "status", "reason", "reason_code",
     "marks", "ambiguous",
     "resolved_by", "hint_note", "turn_margin_m", "inlier_rmse_m", "fitness", "in_slot_share", "coverage", "spacing_m",
-    "level_tops", "n_racks_detected", "n_tubes_detected", "box_source", "box_score", "box_note", "capture_note", *POSE_COLUMNS,
+    "level_tops", "n_racks_detected", "n_tubes_detected", "box_source", "box_score", "box_note", "capture_note",
+    *POSE_COLUMNS,
     "named_by_nats", *BOW_COLUMNS, *RACK_COVARIANCE_COLUMNS,
 )  # fmt: skip
 SENSOR_COLUMNS = (

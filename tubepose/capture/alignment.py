@@ -70,8 +70,8 @@ def align(views: Views, where: str) -> Aligned:
     """Bring cloud and picture together: as they are, without their lens, or the cloud projected into the picture.
 
     Raises:
-        CaptureError: They are not pixel to pixel and what is needed to project is missing, or two CameraInfos contradict
-            each other.
+        CaptureError: They are not pixel to pixel and what is needed to project is missing, or two CameraInfos
+            contradict each other.
     """
     if views.image is None:
         return _alone(views)
@@ -82,7 +82,9 @@ def align(views: Views, where: str) -> Aligned:
         cloud = _with_pixels(views.cloud_m, views.image_camera)
         if not _organised_by(cloud, views.image_camera):
             raise CaptureError(_not_aligned(views, where))
-        told = f"no transform between '{views.source[1]}' and '{views.shot[1]}' is recorded: depth and picture were taken"
+        told = (
+            f"no transform between '{views.source[1]}' and '{views.shot[1]}' is recorded: depth and picture were taken"
+        )
         note = f"{told} to go pixel to pixel, as one CameraInfo fits both" if views.source[1] != views.shot[1] else ""
         return _in_pixels(cloud, views.image, views.image_camera, note)
     still = bool(np.abs(T_image_cloud - np.eye(4)).max() <= _STILL)
@@ -156,8 +158,8 @@ def _refuse_contradiction(views: Views, where: str) -> None:
     one, other = _camera_words(views.source_camera), _camera_words(views.image_camera)
     raise CaptureError(
         f"{where}: two CameraInfos contradict each other by up to {worst:.1f} pixels: {views.infos[0]} ({one}) of the "
-        f"depth and {views.infos[1]} ({other}) of the picture, though both are in frame '{views.shot[1]}'; name the right "
-        f"one: --info-topic {views.infos[0]} or --info-topic {views.infos[1]}"
+        f"depth and {views.infos[1]} ({other}) of the picture, though both are in frame '{views.shot[1]}'; name the "
+        f"right one: --info-topic {views.infos[0]} or --info-topic {views.infos[1]}"
     )
 
 

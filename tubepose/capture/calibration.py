@@ -1,4 +1,4 @@
-"""From CameraInfo messages to cameras: the one of a moment, K or P, binning and region of interest, two that contradict.
+"""From CameraInfo messages to cameras: the one of a moment, K or P, binning, region of interest, contradictions.
 
 Rules of `sensor_msgs/CameraInfo` and of `image_geometry`, which is how ROS reads it.
 """
@@ -53,7 +53,9 @@ def info_at(topic: Topic, stamp_ns: int | None, size: tuple[int, int] | None) ->
     return max(before, key=lambda one: one[0])[1] if before else min(fitting, key=lambda one: one[0])[1]
 
 
-def camera_at(topic: Topic | None, image: Topic, stamp_ns: int | None, size: tuple[int, int] | None) -> PixelCamera | None:
+def camera_at(
+    topic: Topic | None, image: Topic, stamp_ns: int | None, size: tuple[int, int] | None
+) -> PixelCamera | None:
     """The camera of an image at a moment by a topic of CameraInfo; None where there is none.
 
     Args:

@@ -1,8 +1,8 @@
 """Lens distortion and its removal: Brown-Conrady, rational polynomial and Kannala-Brandt (fisheye) models, by OpenCV.
 
-A picture of a distorting lens is sampled anew on the pixels of a pinhole camera. Points of a cloud or a depth image keep
-their coordinates, along the distorted lines of sight on which they were measured; they are only sorted into the new
-pixels. (Brown 1966; Kannala and Brandt 2006; OpenCV's `calib3d` has the formulas.)
+A picture of a distorting lens is sampled anew on the pixels of a pinhole camera. Points of a cloud or a depth image
+keep their coordinates, along the distorted lines of sight on which they were measured; they are only sorted into the
+new pixels. (Brown 1966; Kannala and Brandt 2006; OpenCV's `calib3d` has the formulas.)
 """
 
 from __future__ import annotations
@@ -118,7 +118,9 @@ def without_idle_lens(camera: PixelCamera) -> PixelCamera:
     """The same camera, without its lens where that moves no pixel."""
     if camera.model is None:
         return camera
-    shift = np.abs(_recorded_px(camera)[::8, ::8] - PixelCamera(camera.pinhole).project(camera.pinhole.rays())[::8, ::8])
+    shift = np.abs(
+        _recorded_px(camera)[::8, ::8] - PixelCamera(camera.pinhole).project(camera.pinhole.rays())[::8, ::8]
+    )
     return PixelCamera(camera.pinhole) if np.nanmax(shift, initial=0) < _LEAST_SHIFT_PX else camera
 
 
@@ -147,7 +149,7 @@ def _nearest(
     """Which pixels (H, W, 2) lie in a picture, and the column and row of the nearest pixel (0 for the others)."""
     near = np.rint(seen_px)
     with np.errstate(invalid="ignore"):
-        inside = ((near >= 0) & (near < (size.width, size.height))).all(axis=-1)
+        inside = np.asarray(((near >= 0) & (near < (size.width, size.height))).all(axis=-1))
     u, v = np.where(inside[..., None], near, 0).astype(np.intp).transpose(2, 0, 1)
     return inside, u, v
 
@@ -167,7 +169,7 @@ def _distort(ideal: FloatArray, model: LensModel, coefficients: tuple[float, ...
     """Normalised coordinates (..., 2) behind the lens; NaN stays NaN, and what no picture reaches becomes NaN."""
     flat = ideal.reshape(-1, 2)
     with np.errstate(invalid="ignore"):
-        good = (np.abs(flat) < _FARTHEST).all(axis=1)
+        good = np.asarray((np.abs(flat) < _FARTHEST).all(axis=1))
     points = np.ones((len(flat), 1, 3))
     points[good, 0, :2] = flat[good]
     still, turn, unit = np.zeros(3), np.zeros(3), np.eye(3)

@@ -60,7 +60,7 @@ def _stamps(topic: Topic) -> np.ndarray[tuple[int], np.dtype[np.int64]]:
     return np.array([stamp or 0 for stamp in topic.stamps_ns], dtype=np.int64)
 
 
-def _pass_reach_ns(stamps: Sequence[int] | np.ndarray, offsets: np.ndarray, tolerance_ns: int) -> float:  # type: ignore[type-arg]
+def _pass_reach_ns(stamps: Sequence[int] | np.ndarray, offsets: np.ndarray, tolerance_ns: int) -> float:
     """Half of the least leap between two passes: offsets of one pass differ by less; infinite without passes."""
     back = np.diff(np.asarray(stamps))
     leaps = np.abs(np.diff(offsets))[(back < -tolerance_ns) | (back == 0)]

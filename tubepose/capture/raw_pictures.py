@@ -1,4 +1,4 @@
-"""Encodings of uncompressed pictures as ROS and Foxglove name them, and the conversion of those that are no plain pixels.
+"""Encodings of uncompressed pictures as ROS and Foxglove name them, and the conversion of those that are not plain.
 
 Names: `sensor_msgs/image_encodings.hpp`; conversions by OpenCV. OpenCV names a mosaic by the second row's second and
 third pixel, ROS by the first row's first two.

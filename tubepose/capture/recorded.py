@@ -67,6 +67,8 @@ class RecordedCapture:
             # What is missing lies behind the cut.
             if recording.broken is not None:
                 raise CaptureError(recording.broken_text(self.path, 0)) from None
+            if recording.problems and self.topics == TopicChoice():
+                raise CaptureError(recording.problems[0]) from None
             raise
         pairs = pair_by_stamp(chosen.source, chosen.image, self.max_stamp_difference_ns, where)
         count = 0
@@ -80,15 +82,9 @@ class RecordedCapture:
         self, recording: Recording, chosen: Chosen, index: int, message: StampedMessage, shot: StampedMessage | None
     ) -> RgbdFrame:
         where = f"{self.path}, {chosen.source.name}, message {index + 1}"
-        notes = list(chosen.notes)
-        image = None
-        if shot is not None and chosen.image is not None:
-            try:
-                image = picture(shot.fields, chosen.image.schema, chosen.image.name)
-            except CaptureError as problem:
-                notes.append(f"frame without its picture: {problem}")
-        elif chosen.image is not None:
-            notes.append(f"frame without picture: none of {chosen.image.name} is near in time")
+        if message.problem:
+            raise CaptureError(message.problem)
+        image, notes = _picture(chosen, shot)
         views, colours = self._views(recording, chosen, message, shot if image is not None else None, image, where)
         aligned = align(views, where)
         organised = aligned.cloud_m.shape[0] > 1
@@ -119,13 +115,13 @@ class RecordedCapture:
         """Both views of a moment, and the colours of a cloud that has its own."""
         image_camera = _picture_camera(chosen, shot, image, where)
         is_depth = chosen.source.schema != POINT_CLOUD
-        colours = None
+        colours, source_camera = None, None
         frame_id = _frame_id(recording, chosen.source, message)
         if is_depth:
-            cloud, camera = self._depth_cloud(recording, chosen, message, image_camera, where)
+            cloud, source_camera = self._depth_cloud(recording, chosen, message, image_camera, where)
         else:
             cloud, colours = self._point_cloud(message, where)
-            camera = _camera(chosen.source_info, chosen.source, message, _pixels_of(cloud), where)
+            source_camera = _camera(chosen.source_info, chosen.source, message, _pixels_of(cloud), where)
         shot_frame = _frame_id(recording, chosen.image, shot) if shot is not None and chosen.image is not None else ""
         if not shot_frame:
             info = chosen.image_info if image is not None else chosen.source_info
@@ -134,7 +130,7 @@ class RecordedCapture:
         views = Views(
             cloud_m=cloud,
             image=image,
-            source_camera=camera,
+            source_camera=source_camera,
             image_camera=image_camera,
             T_image_cloud=T_image_cloud,
             source=(chosen.source.name, frame_id),
@@ -147,7 +143,9 @@ class RecordedCapture:
 
     def _point_cloud(self, message: StampedMessage, where: str) -> tuple[FloatArray, NDArray[np.uint8] | None]:
         if self.depth_scale_m is not None:
-            raise CaptureError(f"{where}: --depth-scale is of depth images, and this is a point cloud; give --unit m or mm")
+            raise CaptureError(
+                f"{where}: --depth-scale is of depth images, and this is a point cloud; give --unit m or mm"
+            )
         xyz, colours = cloud_arrays(message.fields, where)
         cloud = clean_cloud(xyz, METRES_PER_UNIT[self.unit or "m"])
         pose = getattr(message.fields, "pose", None)
@@ -187,6 +185,21 @@ class RecordedCapture:
                 f"{UNIT_HINT}"
             )
         return METRES_PER_UNIT["mm"], number_m
+
+
+def _picture(chosen: Chosen, shot: StampedMessage | None) -> tuple[NDArray[np.uint8] | None, list[str]]:
+    """The picture of a frame, and what is to be told of it; one that cannot be read costs the picture alone."""
+    notes = list(chosen.notes)
+    if chosen.image is None:
+        return None, notes
+    if shot is None:
+        return None, [*notes, f"frame without picture: none of {chosen.image.name} is near in time"]
+    try:
+        if shot.problem:
+            raise CaptureError(shot.problem)
+        return picture(shot.fields, chosen.image.schema, chosen.image.name), notes
+    except CaptureError as problem:
+        return None, [*notes, f"frame without its picture: {problem}"]
 
 
 def _camera(
@@ -236,8 +249,8 @@ def _no_camera_text(chosen: Chosen, size: tuple[int, int], where: str) -> str:
             )
     found = "none" if info is None else f"{info.name}, without calibration (zeros)"
     return (
-        f"{where}: a depth image needs the CameraInfo of its camera, found {found}; record it with the depth, or name it "
-        "with --info-topic"
+        f"{where}: a depth image needs the CameraInfo of its camera, found {found}; record it with the depth, or "
+        "name it with --info-topic"
     )
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Iterator
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -31,6 +31,7 @@ class Recording:
         transforms: Between coordinate frames that do not move against each other.
         units: Metres per count of depth images that the RealSense SDK recorded.
         broken: What ended the pass before the end of the file; None for a whole file.
+        problems: Messages of the types that are read that could not be.
     """
 
     topics: dict[str, Topic] = field(default_factory=dict)
@@ -39,6 +40,7 @@ class Recording:
     transforms: StaticTransforms = field(default_factory=StaticTransforms)
     units: DepthUnits = field(default_factory=DepthUnits)
     broken: BrokenRecordingError | None = None
+    problems: list[str] = field(default_factory=list)
 
     def broken_text(self, path: Path, frames: int) -> str:
         """One line about the cut, with the number of frames before it."""
@@ -51,11 +53,19 @@ class Recording:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class StampedMessage:
-    """One message: its topic, its stamp in nanoseconds (None without one), and its decoded fields."""
+    """One message.
+
+    Attributes:
+        topic: Its topic.
+        stamp_ns: Its stamp, nanoseconds; None without one.
+        fields: What it says; None where it cannot be read.
+        problem: Why it cannot be read; empty otherwise.
+    """
 
     topic: str
     stamp_ns: int | None
     fields: Any
+    problem: str = ""
 
 
 def index_recording(path: Path) -> Recording:
@@ -73,8 +83,10 @@ def index_recording(path: Path) -> Recording:
             _note(found, entry, path)
     except BrokenRecordingError as problem:
         broken = problem
+    for name in [name for name, topic in found.topics.items() if topic.first is None]:
+        del found.topics[name]
     if not found.topics and broken is None:
-        raise CaptureError(_nothing_text(path, found.unread))
+        raise CaptureError(found.problems[0] if found.problems else _nothing_text(path, found.unread))
     if path.is_file() and not any(topic.infos for topic in found.topics.values()):
         for part in parts_before(path):
             with suppress(BrokenRecordingError):
@@ -83,7 +95,7 @@ def index_recording(path: Path) -> Recording:
                         _note(found, entry, part)
             if any(topic.infos for topic in found.topics.values()):
                 break
-    return Recording(found.topics, found.unread, found.metadata, found.transforms, found.units, broken)
+    return replace(found, broken=broken)
 
 
 def read_messages(path: Path, topics: Collection[str]) -> Iterator[StampedMessage]:
@@ -91,10 +103,13 @@ def read_messages(path: Path, topics: Collection[str]) -> Iterator[StampedMessag
     with suppress(BrokenRecordingError):
         for entry in _messages(read_raw(path)):
             kind = type_of(entry) if entry.topic in topics else None
-            if kind is not None:
-                yield StampedMessage(
-                    entry.topic, stamp_ns(entry, kind, str(path)), decode_message(entry, kind, str(path))
-                )
+            if kind is None:
+                continue
+            try:
+                stamp = stamp_ns(entry, kind, str(path))
+                yield StampedMessage(entry.topic, stamp, decode_message(entry, kind, str(path)))
+            except CaptureError as problem:
+                yield StampedMessage(entry.topic, None, None, str(problem))
 
 
 def _messages(entries: Iterable[RawMessage | Note]) -> Iterator[RawMessage]:
@@ -112,14 +127,22 @@ def _note(found: Recording, entry: RawMessage | Note, path: Path) -> None:
     if kind is None or kind in (STRING, FLOAT32, TRANSFORM, TRANSFORMS):
         found.unread.setdefault(entry.topic, entry.schema)
         return
-    stamp = stamp_ns(entry, kind, str(path))
-    if entry.topic not in found.topics:
-        found.topics[entry.topic] = Topic(entry.topic, kind, decode_message(entry, kind, str(path)))
-    topic = found.topics[entry.topic]
-    topic.stamps_ns.append(stamp)
-    topic.log_times_ns.append(entry.log_time_ns)
-    if kind == CAMERA_INFO:
-        topic.note_info(stamp, decode_message(entry, kind, str(path)))
+    known = found.topics.get(entry.topic)
+    stamp, fields = None, None
+    try:
+        stamp = stamp_ns(entry, kind, str(path))
+        if kind == CAMERA_INFO or known is None or known.first is None:
+            fields = decode_message(entry, kind, str(path))
+    except CaptureError as problem:
+        found.problems.append(str(problem))
+    if known is None:
+        known = found.topics[entry.topic] = Topic(entry.topic, kind, fields)
+    elif known.first is None:
+        known = found.topics[entry.topic] = replace(known, first=fields)
+    known.stamps_ns.append(stamp)
+    known.log_times_ns.append(entry.log_time_ns)
+    if kind == CAMERA_INFO and fields is not None:
+        known.note_info(stamp, fields)
 
 
 def _note_small(found: Recording, entry: RawMessage, kind: str, where: str) -> None:
@@ -144,6 +167,6 @@ def _nothing_text(path: Path, unread: dict[str, str]) -> str:
     found = told_types(unread) or "no messages"
     kind = "ROS 1 or " if recording_suffix(path) == ".bag" else ""
     return (
-        f"{path}: nothing to make a frame of; expected {kind}ROS 2 sensor_msgs/msg/PointCloud2, or Image with depth and "
-        f"CameraInfo, or Foxglove's PointCloud or images, found {found}; record one of these, decompressed"
+        f"{path}: nothing to make a frame of; expected {kind}ROS 2 sensor_msgs/msg/PointCloud2, or Image with "
+        f"depth and CameraInfo, or Foxglove's PointCloud or images, found {found}; record one of these, decompressed"
     )

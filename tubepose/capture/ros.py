@@ -144,8 +144,8 @@ def depth_image(message: Any, schema: str, where: str, metres_per_count: float, 
     layout = _layout(message, where)
     if layout.channels != 1 or layout.conversion is not None or layout.kind == "u1":
         raise CaptureError(
-            f"{where}: expected depth as {' or '.join(DEPTH_ENCODINGS)}, found '{message.encoding}'; name the depth with "
-            "--depth-topic"
+            f"{where}: expected depth as {' or '.join(DEPTH_ENCODINGS)}, found '{message.encoding}'; name the depth "
+            "with --depth-topic"
         )
     scale = metres_per_number if layout.kind.startswith("f") else metres_per_count
     return depth_to_metres(image_array(message, where), scale)

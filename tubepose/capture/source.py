@@ -12,8 +12,8 @@ from typing import Literal, Protocol, TypedDict, Unpack
 from tubepose.capture.description import CAPTURE_FILE, Unit, is_depth_scale
 from tubepose.capture.folder import FolderCapture, is_capture_folder, is_remains
 from tubepose.capture.formats.bop import BopScene, bop_cameras, is_bop_camera
-from tubepose.capture.formats.containers import SUFFIXES, is_recording, recording_suffix
 from tubepose.capture.formats.cloud_files import CLOUD_READERS, CloudFileCapture
+from tubepose.capture.formats.containers import SUFFIXES, is_recording, recording_suffix
 from tubepose.capture.formats.depth_folders import DepthFolder, is_depth_folder
 from tubepose.capture.formats.depth_images import DEPTH_SUFFIXES
 from tubepose.capture.formats.depth_sequences import GivenScale
@@ -176,7 +176,11 @@ class _Opener:
 
 def _is_capture(path: Path) -> bool:
     """True for a folder that is one capture, whatever its layout."""
-    return is_recording(path) or is_capture_folder(path) or (path.is_dir() and (bool(bop_cameras(path)) or is_depth_folder(path)))
+    return (
+        is_recording(path)
+        or is_capture_folder(path)
+        or (path.is_dir() and (bool(bop_cameras(path)) or is_depth_folder(path)))
+    )
 
 
 def _unknown_words(path: Path) -> str:

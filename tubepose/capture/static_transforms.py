@@ -1,4 +1,4 @@
-"""Transforms between coordinate frames that do not move against each other: `/tf_static`, and `/tf` that stands still."""
+"""Transforms between coordinate frames that do not move: `/tf_static`, and what stands still of `/tf`."""
 
 from __future__ import annotations
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
-from os.path import commonprefix
+from itertools import takewhile
 from typing import Any
 
 from tubepose.capture.compressed_depth import is_compressed_depth
@@ -73,10 +73,15 @@ class Topic:
     def is_depth(self) -> bool:
         """True for an image that holds depth by its encoding, or by its name if its encoding is a 16-bit picture's."""
         if self.schema == COMPRESSED_IMAGE:
-            return is_compressed_depth(self.first.format) or (self._says_depth and is_depth_png(self.first.data))
+            return self.is_compressed_depth or (self._says_depth and is_depth_png(self.first.data))
         if self.schema != IMAGE:
             return False
         return self.first.encoding in DEPTH_ENCODINGS or (self.first.encoding in _COUNTS and self._says_depth)
+
+    @property
+    def is_compressed_depth(self) -> bool:
+        """True for depth of ROS's `compressedDepth`."""
+        return self.schema == COMPRESSED_IMAGE and is_compressed_depth(self.first.format)
 
     @property
     def may_be_depth(self) -> bool:
@@ -154,6 +159,10 @@ def choose_topics(
     found = {topic.name: topic for topic in topics}
     source = _source(found, asked, where, unread or {})
     image = _pick(found, asked.image, lambda t: _may_be_picture(t, source), "image", where, _best_pictures)
+    if image is not None and image is not source and image.schema == COMPRESSED_IMAGE and image.is_compressed_depth:
+        raise CaptureError(
+            f"{where}: {image.name} is a compressed depth image, no picture; choose another --image-topic"
+        )
     if image is source:
         raise CaptureError(
             f"{where}: --image-topic {image.name} is the depth that the frames are made of; name a picture instead"
@@ -259,12 +268,17 @@ def _named(topic: Topic, words: tuple[str, ...]) -> bool:
     return any(word in topic.name.lower() for word in words)
 
 
+def _shared_folders(one: str, other: str) -> list[str]:
+    pairs = takewhile(lambda pair: pair[0] == pair[1], zip(one.split("/"), other.split("/"), strict=False))
+    return [first for first, _ in pairs]
+
+
 def _words(name: str) -> set[str]:
     return set(re.findall(r"[a-z]+", name.lower()))
 
 
 def _info_of(topic: Topic, found: dict[str, Topic]) -> Topic | None:
-    """The CameraInfo of a topic: beside it by its name (ROS, Foxglove, RealSense SDK), else the nearest of its frame."""
+    """The CameraInfo of a topic: beside it by its name (ROS, Foxglove, RealSense), else the nearest of its frame."""
     infos = [other for other in found.values() if other.schema == CAMERA_INFO]
     folder = topic.base_name.rsplit("/", 1)[0]
     usual = [f"{folder}/camera_info", f"{topic.base_name}/camera_info", f"{folder}/calibration"]
@@ -274,7 +288,7 @@ def _info_of(topic: Topic, found: dict[str, Topic]) -> Topic | None:
             return found[name]
     same = [info for info in infos if topic.frame_id and info.frame_id == topic.frame_id]
     if same:
-        shared = [len(commonprefix([info.name.split("/"), topic.name.split("/")])) for info in same]
+        shared = [len(_shared_folders(info.name, topic.name)) for info in same]
         nearest = [info for info, share in zip(same, shared, strict=True) if share == max(shared)]
         if len(nearest) == 1:
             return nearest[0]

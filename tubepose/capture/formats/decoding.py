@@ -61,9 +61,11 @@ def decode_message(message: RawMessage, kind: str, where: str) -> Any:
             f"{where}: {message.topic} is encoded as {message.encoding or 'nothing'}; expected cdr, as 'ros2 bag "
             "record -s mcap' writes it, ros1, or a Foxglove message in protobuf or json"
         )
+    from rosbags.serde import SerdeError
+
     try:
         return decoder(message.data)
-    except _UNDECODABLE as problem:
+    except (*_UNDECODABLE, SerdeError) as problem:
         raise CaptureError(
             f"{where}: a message of {message.topic} is not the {message.schema} it claims to be: {problem}"
         ) from None

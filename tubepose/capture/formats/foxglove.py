@@ -81,11 +81,11 @@ def _message_class(schema: str, definition: bytes) -> Any:
         added.add(name)
         for needed in files[name].dependency:
             add(needed)
-        pool.Add(files[name])  # type: ignore[no-untyped-call]
+        pool.Add(files[name])
 
     for name in files:
         add(name)
-    return GetMessageClass(pool.FindMessageTypeByName(schema))  # type: ignore[no-untyped-call]
+    return GetMessageClass(pool.FindMessageTypeByName(schema))
 
 
 class _Json:
