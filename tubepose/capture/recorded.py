@@ -73,7 +73,13 @@ class RecordedCapture:
         pairs = pair_by_stamp(chosen.source, chosen.image, self.max_stamp_difference_ns, where)
         count = 0
         for cloud, shot in _paired(self.path, chosen, pairs):
-            yield self._frame(recording, chosen, count, cloud, shot)
+            try:
+                frame = self._frame(recording, chosen, count, cloud, shot)
+            except CaptureError as problem:
+                if recording.broken is None:
+                    raise
+                raise CaptureError(f"{problem}; {recording.broken_text(self.path, count)}") from None
+            yield frame
             count += 1
         if recording.broken is not None:
             raise CaptureError(recording.broken_text(self.path, count))

@@ -127,7 +127,7 @@ def _read_stream(stream: IO[bytes], path: Path, shown: Path) -> Iterator[RawMess
     elif start == sqlite_bag.MAGIC:
         yield from sqlite_bag.read_sqlite_bag(path, shown)
     elif start.startswith(ros1_bag.MAGIC):
-        yield from ros1_bag.read_ros1_bag(path)
+        yield from ros1_bag.read_ros1_bag(stream)
     else:
         kinds = {".mcap": "an MCAP file", ".db3": "a ROS 2 bag in SQLite", ".bag": "a ROS 1 bag"}
         expected = kinds.get(recording_suffix(shown), "an MCAP file, a ROS 2 bag in SQLite or a ROS 1 bag")

@@ -7,6 +7,7 @@ cut file.
 from __future__ import annotations
 
 import sqlite3
+import struct
 from collections.abc import Iterator
 from pathlib import Path
 from urllib.parse import quote
@@ -15,6 +16,7 @@ from tubepose.capture.formats.raw_messages import BrokenRecordingError, RawMessa
 from tubepose.errors import CaptureError
 
 MAGIC = b"SQLite format 3\x00"
+_HEADER_BYTES = 100
 
 
 def read_sqlite_bag(path: Path, shown: Path) -> Iterator[RawMessage]:
@@ -36,15 +38,45 @@ def read_sqlite_bag(path: Path, shown: Path) -> Iterator[RawMessage]:
     except sqlite3.Error as problem:
         raise BrokenRecordingError(str(problem), cut=False) from None
     try:
-        yield from _messages(connection, shown)
+        yield from _without_last(_messages(connection, shown)) if _is_cut(path) else _messages(connection, shown)
     except (sqlite3.Error, OverflowError) as problem:
         raise BrokenRecordingError(str(problem), cut="malformed" in str(problem)) from None
     finally:
         connection.close()
 
 
+def _is_cut(path: Path) -> bool:
+    """Whether a database is shorter than the pages that its header counts (https://sqlite.org/fileformat2.html)."""
+    with path.open("rb") as stream:
+        header = stream.read(_HEADER_BYTES)
+    if len(header) < _HEADER_BYTES:
+        return True
+    (page_bytes,), (pages,) = struct.unpack_from(">H", header, 16), struct.unpack_from(">I", header, 28)
+    return pages * (65536 if page_bytes == 1 else page_bytes) > path.stat().st_size
+
+
+def _without_last(messages: Iterator[RawMessage]) -> Iterator[RawMessage]:
+    """Messages of a database that is cut: SQLite reads what is missing of its last page as zeros.
+
+    Raises:
+        BrokenRecordingError: Always, after all but the last one.
+    """
+    held: RawMessage | None = None
+    try:
+        for message in messages:
+            if held is not None:
+                yield held
+            held = message
+    except sqlite3.Error:
+        pass
+    raise BrokenRecordingError("", cut=True)
+
+
 def _open(path: Path, options: str) -> sqlite3.Connection:
-    return sqlite3.connect(f"file:{quote(str(path.resolve()))}?{options}", uri=True)
+    connection = sqlite3.connect(f"file:{quote(str(path.resolve()))}?{options}", uri=True)
+    # Without it SQLite opens no file that is shorter than its header says.
+    connection.execute("PRAGMA writable_schema = ON")
+    return connection
 
 
 def _messages(connection: sqlite3.Connection, shown: Path) -> Iterator[RawMessage]:
