@@ -19,7 +19,16 @@ from rosbags.typesys import Stores, get_typestore
 
 from tubepose.capture import CameraIntrinsics, RgbdFrame, open_captures
 from tubepose.capture import mcap_writing as writing
-from tubepose.capture.message_types import CAMERA_INFO, DEFINITIONS, IMAGE, POINT_CLOUD, STRING, TRANSFORMS
+from tubepose.capture.message_types import (
+    CAMERA_INFO,
+    DEFINITIONS,
+    FLOAT32,
+    IMAGE,
+    POINT_CLOUD,
+    STRING,
+    TRANSFORM,
+    TRANSFORMS,
+)
 from tubepose.transforms import FloatArray, quaternion_wxyz
 
 STAMP_NS = 1_700_000_000_123_456_789
@@ -32,6 +41,12 @@ DEPTH = np.random.default_rng(1).uniform(0.5, 1.2, (24, 32)).astype(np.float32)
 _TEXTS = {
     **DEFINITIONS,
     STRING: "string data\n",
+    FLOAT32: "float32 data\n",
+    TRANSFORM: (
+        "geometry_msgs/Vector3 translation\ngeometry_msgs/Quaternion rotation\n" + "=" * 80 + "\n"
+        "MSG: geometry_msgs/Vector3\nfloat64 x\nfloat64 y\nfloat64 z\n" + "=" * 80 + "\n"
+        "MSG: geometry_msgs/Quaternion\nfloat64 x\nfloat64 y\nfloat64 z\nfloat64 w\n"
+    ),
     TRANSFORMS: (
         "geometry_msgs/TransformStamped[] transforms\n" + "=" * 80 + "\nMSG: geometry_msgs/TransformStamped\n"
         "std_msgs/Header header\nstring child_frame_id\ngeometry_msgs/Transform transform\n" + "=" * 80 + "\n"
@@ -130,8 +145,8 @@ def bag2(
     return folder
 
 
-def bag1(path: Path, messages: list[Message], compression: str | None = None) -> Path:
-    """A ROS 1 bag, written by rosbags."""
+def bag1(path: Path, messages: list[Message], compression: str | None = None, behind: bytes = b"") -> Path:
+    """A ROS 1 bag, written by rosbags; `behind` is left behind every message."""
     writer = Writer1(path)
     if compression is not None:
         writer.set_compression(Writer1.CompressionFormat[compression])
@@ -142,7 +157,7 @@ def bag1(path: Path, messages: list[Message], compression: str | None = None) ->
             if topic not in connections:
                 known = old if schema in old.fielddefs else types()
                 connections[topic] = writer.add_connection(topic, schema, typestore=known)
-            writer.write(connections[topic], STAMP_NS + number, ros1(schema, message))
+            writer.write(connections[topic], STAMP_NS + number, ros1(schema, message) + behind)
     return path
 
 

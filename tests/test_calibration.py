@@ -206,7 +206,9 @@ def test_infos_that_agree_within_half_a_pixel_do_not_contradict(tmp_path):
 
 # Transforms -------------------------------------------------------------------------------------------------------------
 
-T_COLOR_DEPTH = make_transform(Rotation.from_euler("xyz", [2, -3, 4], degrees=True).as_matrix(), np.array([0.03, 0, 0.01]))
+T_COLOR_DEPTH = make_transform(
+    Rotation.from_euler("xyz", [2, -3, 4], degrees=True).as_matrix(), np.array([0.03, 0, 0.01])
+)
 T_BASE_COLOR = make_transform(Rotation.from_euler("xyz", [170, 5, 20], degrees=True).as_matrix(), np.array([1, 2, 0.9]))
 
 

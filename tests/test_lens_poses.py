@@ -40,7 +40,7 @@ def surfaces() -> Surfaces:
     cap = load_cap("printed-square-16.7")
     sensor = replace(default_camera(), intrinsics=CAMERA)
     scene = random_scene(RACK, [TUBE], cap, sensor, np.random.default_rng(5), SceneVariation(fill=(0.12, 0.16)))
-    return Surfaces((part for part in scene.parts() if part[1].plastic is None))
+    return Surfaces(part for part in scene.parts() if part[1].plastic is None)
 
 
 def depth_of(surfaces: Surfaces, camera: PixelCamera) -> FloatArray:

@@ -183,6 +183,8 @@ def told_types(types: Mapping[str, str]) -> str:
 
 def _may_be_picture(topic: Topic, source: Topic) -> bool:
     """Beside a point cloud an image of floats or 16 bits named texture, ir or the like is a picture."""
+    if topic is source:
+        return False
     return topic.is_picture or (source.schema == POINT_CLOUD and topic.is_image and topic.is_gray_by_name)
 
 

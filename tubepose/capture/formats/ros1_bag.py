@@ -50,9 +50,7 @@ def read_ros1_bag(stream: IO[bytes]) -> Iterator[RawMessage]:
         raise BrokenRecordingError(str(problem), cut=isinstance(problem, EOFError)) from None
 
 
-def _message(
-    fields: Fields, data: bytes, connections: dict[bytes, tuple[str, str, bytes]]
-) -> Iterator[RawMessage]:
+def _message(fields: Fields, data: bytes, connections: dict[bytes, tuple[str, str, bytes]]) -> Iterator[RawMessage]:
     """The message of a record; a record of a connection is noted, all others say nothing."""
     kind = fields[b"op"][0]
     if kind == _CONNECTION:
