@@ -94,7 +94,7 @@ def test_models_are_told_by_their_name_and_others_are_refused():
         camera_of(info(d=BROWN, distortion_model="ftheta"), rectified=False)
 
 
-# Binning and region of interest -----------------------------------------------------------------------------------------
+# Binning and region of interest --------------------------------------------------------------------------------------
 
 
 def test_binning_and_region_of_interest_as_image_geometry_has_them():
@@ -124,7 +124,7 @@ def test_a_cut_and_binned_depth_image_gives_the_points_of_the_whole_one(tmp_path
     assert (frame.intrinsics.width, frame.intrinsics.height) == (20, 16)
 
 
-# The CameraInfo of a moment ---------------------------------------------------------------------------------------------
+# The CameraInfo of a moment ------------------------------------------------------------------------------------------
 
 
 def track(*stamps_ms: float) -> Topic:
@@ -184,7 +184,7 @@ def test_a_change_of_resolution_is_followed_by_depth_whose_own_info_is_not(tmp_p
     np.testing.assert_allclose(second.cloud_m, WIDE.backproject(plane), atol=1e-7)
 
 
-# Two CameraInfos --------------------------------------------------------------------------------------------------------
+# Two CameraInfos -----------------------------------------------------------------------------------------------------
 
 
 def test_infos_that_contradict_each_other_are_told_and_the_option_to_paste_works(tmp_path):
@@ -204,7 +204,7 @@ def test_infos_that_agree_within_half_a_pixel_do_not_contradict(tmp_path):
     assert frame.intrinsics == CAMERA
 
 
-# Transforms -------------------------------------------------------------------------------------------------------------
+# Transforms ----------------------------------------------------------------------------------------------------------
 
 T_COLOR_DEPTH = make_transform(
     Rotation.from_euler("xyz", [2, -3, 4], degrees=True).as_matrix(), np.array([0.03, 0, 0.01])

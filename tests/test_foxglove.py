@@ -157,7 +157,7 @@ def test_messages_that_cannot_be_read_are_one_line(tmp_path, schema, data, found
         read_all(tmp_path / "a.mcap")
 
 
-# Protobuf ---------------------------------------------------------------------------------------------------------------
+# Protobuf ------------------------------------------------------------------------------------------------------------
 
 _T = FieldDescriptorProto
 

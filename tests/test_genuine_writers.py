@@ -29,7 +29,7 @@ def sdk(name: str) -> Any:
     return pytest.importorskip(name, reason="pip install tubepose[writers]", exc_type=ImportError)
 
 
-# RealSense SDK -------------------------------------------------------------------------------------------------------------
+# RealSense SDK -------------------------------------------------------------------------------------------------------
 
 
 def stream(rs: Any, kind: str, camera: CameraIntrinsics, lens: tuple[float, ...] | None) -> Any:
@@ -131,7 +131,7 @@ def test_realsense_cameras_that_are_not_related_are_not_registered(tmp_path):
         read_all(path)
 
 
-# Foxglove SDK -------------------------------------------------------------------------------------------------------------
+# Foxglove SDK --------------------------------------------------------------------------------------------------------
 
 
 def foxglove_file(path: Path, messages: list[tuple[str, Any]]) -> Path:

@@ -133,7 +133,7 @@ def test_a_size_that_an_encoding_cannot_have_is_named():
         picture(message, IMAGE, "here")
 
 
-# A picture that cannot be read ------------------------------------------------------------------------------------------
+# A picture that cannot be read ---------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("make", [shots, cloud_shots])
@@ -159,7 +159,7 @@ def test_compressed_video_beside_a_cloud_leaves_the_cloud(tmp_path):
     assert "/color/compressed: cannot be decoded" in frame.notes[0]
 
 
-# Depth ------------------------------------------------------------------------------------------------------------------
+# Depth ---------------------------------------------------------------------------------------------------------------
 
 
 def test_depth_as_mono16_is_told_by_its_name(tmp_path):

@@ -116,11 +116,11 @@ def test_other_recordings_keep_the_unit_of_ros(tmp_path):
     np.testing.assert_allclose(frame.cloud_m[..., 2], 0.3)
 
 
-# ROS 1 bags, as the SDK's recorder wrote them before 2.58 ------------------------------------------------------------------
+# ROS 1 bags, as the SDK's recorder wrote them before 2.58 ------------------------------------------------------------
 
 
 def old_recording(unit_m: float | None = 1e-4, name: str = "Depth_Units") -> list:
-    """Topics, types and fields of a bag of librealsense 2.55: infos without frames, P of zeros, transforms in topics."""
+    """Topics and fields of a bag of librealsense 2.55: infos without frames, P of zeros, transforms in topics."""
     device = "/device_0"
     depth = image_message(np.full((24, 32), 3000, np.uint16), "mono16", frame_id="1")
     colour = image_message(np.full((48, 64, 3), 90, np.uint8), "rgb8", frame_id="1")

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import sqlite3
+import struct
 from pathlib import Path
 
 import numpy as np
@@ -9,6 +10,7 @@ import yaml
 import zstandard
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from mcap.writer import CompressionType, Writer
 from recordings import (
     CAMERA,
     DEPTH,
@@ -215,7 +217,7 @@ def test_a_database_that_is_no_bag_is_named(tmp_path):
 
 
 def test_a_file_that_inflates_without_end_is_refused(tmp_path, monkeypatch):
-    monkeypatch.setattr("tubepose.capture.formats.containers._LEAST_LIMIT_BYTES", 1 << 20)
+    monkeypatch.setattr("tubepose.capture.formats.containers.LEAST_LIMIT_BYTES", 1 << 20)
     (tmp_path / "a.mcap.zst").write_bytes(zstandard.compress(bytes(4 << 20)))
     with pytest.raises(CaptureError, match="holds more than 200 times its own size"):
         read_all(tmp_path / "a.mcap.zst")
@@ -253,3 +255,33 @@ def test_a_log_beside_the_database_is_read(tmp_path):
     live.close()
     frames = read_all(copied / made.name)
     assert [frame.timestamp_ns for frame in frames] == [STAMP_NS, STAMP_NS + SECOND_NS]
+
+
+@pytest.mark.parametrize("compression", [CompressionType.ZSTD, CompressionType.LZ4])
+@pytest.mark.parametrize("claims", [True, False])
+def test_a_chunk_that_inflates_without_end_is_refused(tmp_path, monkeypatch, compression, claims):
+    """Whether it says so or not."""
+    with (tmp_path / "a.mcap").open("wb") as stream:
+        writer = Writer(stream, compression=compression, enable_crcs=False)
+        writer.start()
+        schema = writer.register_schema("a/msg/B", "ros2msg", b"")
+        writer.add_message(writer.register_channel("/t", "cdr", schema), 1, bytes(4 << 20), 1)
+        writer.finish()
+    data = bytearray((tmp_path / "a.mcap").read_bytes())
+    size = data.index(struct.pack("<Q", _chunk_bytes(bytes(data))))
+    if not claims:
+        data[size : size + 8] = struct.pack("<Q", 1000)
+    (tmp_path / "a.mcap").write_bytes(data)
+    monkeypatch.setattr("tubepose.capture.formats.mcap_file.LEAST_LIMIT_BYTES", 1 << 20)
+    with pytest.raises(CaptureError, match=r"a chunk of \d+ bytes"):
+        read_all(tmp_path / "a.mcap")
+
+
+def _chunk_bytes(data: bytes) -> int:
+    """Size that the first chunk claims."""
+    at = data.index(b"\x06", 9)
+    while True:
+        (size,) = struct.unpack_from("<Q", data, at + 9 + 16)
+        if (4 << 20) < size < (5 << 20):
+            return int(size)
+        at = data.index(b"\x06", at + 1)

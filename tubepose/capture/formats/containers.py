@@ -11,7 +11,14 @@ import yaml
 import zstandard
 
 from tubepose.capture.formats import mcap_file, ros1_bag, sqlite_bag
-from tubepose.capture.formats.raw_messages import BrokenRecordingError, Note, RawMessage, unreadable
+from tubepose.capture.formats.raw_messages import (
+    LEAST_LIMIT_BYTES,
+    MOST_INFLATED,
+    BrokenRecordingError,
+    Note,
+    RawMessage,
+    unreadable,
+)
 from tubepose.errors import CaptureError
 
 SUFFIXES = (".mcap", ".db3", ".bag")
@@ -21,9 +28,6 @@ METADATA_FILE = "metadata.yaml"
 
 _INFORMATION = "rosbag2_bagfile_information"
 _START_BYTES = 16
-# Images do not compress further than this; a file that does is made to fill the disk.
-_MOST_INFLATED = 200
-_LEAST_LIMIT_BYTES = 64 << 20
 _BLOCK_BYTES = 1 << 20
 _MOST_METADATA_BYTES = 16 << 20
 
@@ -140,7 +144,7 @@ def _inflate_file(stream: IO[bytes], whole: IO[bytes], path: Path) -> bool:
     Raises:
         CaptureError: No zstd, or more than any recording.
     """
-    limit = max(_MOST_INFLATED * path.stat().st_size, _LEAST_LIMIT_BYTES)
+    limit = max(MOST_INFLATED * path.stat().st_size, LEAST_LIMIT_BYTES)
     written = 0
     try:
         with zstandard.ZstdDecompressor().stream_reader(stream) as reader:
@@ -148,7 +152,7 @@ def _inflate_file(stream: IO[bytes], whole: IO[bytes], path: Path) -> bool:
                 written += whole.write(block)
                 if written > limit:
                     raise CaptureError(
-                        f"{path}: holds more than {_MOST_INFLATED} times its own size, as no recording does; check it, "
+                        f"{path}: holds more than {MOST_INFLATED} times its own size, as no recording does; check it, "
                         f"or decompress it first: zstd -d {path.name}"
                     )
     except zstandard.ZstdError as problem:

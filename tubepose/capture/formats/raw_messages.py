@@ -9,6 +9,9 @@ from tubepose.errors import CaptureError
 
 # A message of more bytes is none: the largest clouds of today's sensors have 0.3 GB.
 MAX_MESSAGE_BYTES = 1 << 30
+# Images do not compress further than this; what does is made to fill memory.
+MOST_INFLATED = 200
+LEAST_LIMIT_BYTES = 64 << 20
 _ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
 
 

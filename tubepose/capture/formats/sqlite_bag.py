@@ -52,7 +52,7 @@ def _is_cut(path: Path) -> bool:
     if len(header) < _HEADER_BYTES:
         return True
     (page_bytes,), (pages,) = struct.unpack_from(">H", header, 16), struct.unpack_from(">I", header, 28)
-    return pages * (65536 if page_bytes == 1 else page_bytes) > path.stat().st_size
+    return bool(pages * (65536 if page_bytes == 1 else page_bytes) > path.stat().st_size)
 
 
 def _without_last(messages: Iterator[RawMessage]) -> Iterator[RawMessage]:
