@@ -156,8 +156,10 @@ def test_infos_of_zeros_are_skipped(tmp_path):
     zero = (name, kind, info_message(changes=ZEROS))
     (frame,) = read_all(mcap(tmp_path / "a.mcap", [zero, *shots()]))
     assert_same(frame)
-    with pytest.raises(CaptureError, match=r"/camera/color/camera_info, without calibration \(zeros\)"):
-        read_all(mcap(tmp_path / "b.mcap", [zero, *shots()[1:]]))
+    identity = (name, kind, info_message(changes={"k": np.eye(3).ravel().tolist(), "p": np.eye(3, 4).ravel().tolist()}))
+    for none in (zero, identity):
+        with pytest.raises(CaptureError, match=r"/camera/color/camera_info, without calibration"):
+            read_all(mcap(tmp_path / "b.mcap", [none, *shots()[1:]]))
 
 
 def test_changes_of_k_are_followed(tmp_path):

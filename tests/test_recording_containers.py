@@ -121,6 +121,11 @@ def test_a_part_that_is_lost_is_named_and_the_others_are_read_by_themselves(tmp_
         read_all(folder)
     with pytest.raises(CaptureError, match="needs the CameraInfo of its camera, found none"):
         read_all(folder / "scan_1.mcap")
+    folder = split(tmp_path / "other")
+    (folder / "scan_1.mcap").unlink()
+    with pytest.raises(CaptureError, match=r"lists scan_1\.mcap, which is not there"):
+        read_all(folder)
+    assert_same(read_all(folder / "scan_0.mcap")[0])
 
 
 @pytest.mark.parametrize("kind", ["mcap", "db3"])

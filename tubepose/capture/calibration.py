@@ -164,4 +164,4 @@ def _matrix(numbers: Sequence[float], columns: int) -> FloatArray | None:
     """The first three columns of K or P; None without focal lengths."""
     matrix = np.asarray(numbers, dtype=float).reshape(3, columns)[:, :3]
     good = np.isfinite(matrix).all() and min(matrix[0, 0], matrix[1, 1]) > 0
-    return matrix if good else None
+    return matrix if good and not np.array_equal(matrix[:, :3], np.eye(3)) else None

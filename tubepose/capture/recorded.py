@@ -253,7 +253,7 @@ def _no_camera_text(chosen: Chosen, size: tuple[int, int], where: str) -> str:
                 f"{where}: the depth image is {size[1]} x {size[0]} pixels, its CameraInfo {other.width} x "
                 f"{other.height}; name the one that fits with --info-topic"
             )
-    found = "none" if info is None else f"{info.name}, without calibration (zeros)"
+    found = "none" if info is None else f"{info.name}, without calibration (zeros, or numbers that no camera has)"
     return (
         f"{where}: a depth image needs the CameraInfo of its camera, found {found}; record it with the depth, or "
         "name it with --info-topic"

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tubepose.capture.compressed_depth import decode_compressed_depth, is_compressed_depth
+from tubepose.capture.frame import CameraIntrinsics
 from tubepose.capture.images import decode, depth_counts, to_picture
 from tubepose.capture.message_types import COMPRESSED_IMAGE
 from tubepose.capture.raw_pictures import ENCODINGS, Layout, to_colours
@@ -152,11 +153,10 @@ def depth_image(message: Any, schema: str, where: str, metres_per_count: float, 
 
 
 def is_calibrated(info: Any) -> bool:
-    """Whether a CameraInfo holds a camera: K or P with focal lengths, and a size."""
-    return bool(info.width > 0 and info.height > 0 and any(_has_focal(rows) for rows in (info.k, info.p)))
+    """Whether a CameraInfo holds a camera: a size, and K or P with what a camera can have (no zeros, no identity)."""
+    return any(_pinhole(info, np.asarray(rows, dtype=float).reshape(3, -1)) for rows in (info.k, info.p))
 
 
-def _has_focal(matrix: Any) -> bool:
-    numbers = np.asarray(matrix, dtype=float)
-    columns = 3 if len(numbers) == 9 else 4
-    return bool(np.isfinite(numbers).all() and numbers[0] > 0 and numbers[columns + 1] > 0)
+def _pinhole(info: Any, matrix: FloatArray) -> bool:
+    numbers = (matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2])
+    return bool(np.isfinite(matrix).all()) and not CameraIntrinsics(int(info.width), int(info.height), *numbers).fault
