@@ -119,7 +119,7 @@ def test_realsense_lens_is_removed_as_the_sdk_itself_does(tmp_path):
 
 def test_realsense_without_a_unit_asks_for_it(tmp_path):
     path = realsense(tmp_path / "a.db3", None, COUNTS, COLOUR)
-    with pytest.raises(CaptureError, match="give --depth-scale 0.001"):
+    with pytest.raises(CaptureError, match=r"give --depth-scale 0\.001"):
         read_all(path)
     (frame,) = read_all(path, depth_scale_m=0.001)
     assert float(np.median(frame.measured_m[:, 2])) == pytest.approx(3.0, abs=0.2)

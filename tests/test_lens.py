@@ -76,6 +76,7 @@ def test_depth_and_picture_come_out_as_without_the_lens(tmp_path, name, topic):
     (frame,) = read_all(mcap(tmp_path / "a.mcap", recorded(name, topic)))
     assert frame.intrinsics == CAMERA
     assert frame.timestamp_ns == STAMP_NS
+    assert [note.split()[0] for note in frame.notes] == ([topic] if "rect" in topic else [])
     depth, picture = seen_by(PixelCamera(CAMERA))
     points = frame.measured_m
     assert frame.valid.mean() > 0.8

@@ -192,6 +192,15 @@ def test_depth_as_a_png_of_16_bits(tmp_path, form):
     np.testing.assert_array_equal(frame.image, GRAY)
 
 
+def test_depth_as_a_tiff_of_floats(tmp_path):
+    """What compressed_image_transport makes of 32FC1."""
+    data = cv2.imencode(".tiff", DEPTH)[1].tobytes()
+    message = header() | {"format": "32FC1; tiff compressed ", "data": data}
+    messages = [*shots()[:2], (f"{DEPTH_TOPIC}/compressed", COMPRESSED_IMAGE, message)]
+    (frame,) = read_all(mcap(tmp_path / "a.mcap", messages))
+    np.testing.assert_allclose(frame.cloud_m[..., 2], DEPTH)
+
+
 def test_a_coloured_picture_of_depth_is_no_depth(tmp_path):
     data = cv2.imencode(".png", smooth())[1].tobytes()
     name = "/camera/depth/image_coloured/compressed"

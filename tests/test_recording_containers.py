@@ -211,6 +211,8 @@ def test_the_content_tells_the_kind_and_not_the_ending(tmp_path):
     path = bag1(tmp_path / "scan.bag", shots())
     (frame,) = read_all(path.rename(tmp_path / "scan.mcap"))
     assert_same(frame)
+    (frame,) = read_all((tmp_path / "scan.mcap").rename(tmp_path / "scan.bag.active"))  # one that was not closed
+    assert_same(frame)
 
 
 def test_a_database_that_is_no_bag_is_named(tmp_path):

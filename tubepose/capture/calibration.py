@@ -68,7 +68,12 @@ def camera_at(
         CaptureError: A distortion that is not read.
     """
     info = info_at(topic, stamp_ns, size) if topic is not None else None
-    return camera_of(info, rectified="rect" in image.base_name.split("/")[-1], size=size) if info is not None else None
+    return camera_of(info, rectified=is_rectified(image.base_name), size=size) if info is not None else None
+
+
+def is_rectified(name: str) -> bool:
+    """Whether an image's topic calls it the rectified one."""
+    return "rect" in name.rsplit("/", 1)[-1]
 
 
 def camera_of(info: Any, *, rectified: bool, size: tuple[int, int] | None = None) -> PixelCamera | None:

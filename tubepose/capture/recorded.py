@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tubepose.capture.alignment import Views, align
-from tubepose.capture.calibration import camera_at, info_at
+from tubepose.capture.calibration import camera_at, info_at, is_rectified
 from tubepose.capture.description import Unit
 from tubepose.capture.frame import RgbdFrame
 from tubepose.capture.lens import PixelCamera
@@ -92,6 +92,7 @@ class RecordedCapture:
             raise CaptureError(message.problem)
         image, notes = _picture(chosen, shot)
         views, colours = self._views(recording, chosen, message, shot if image is not None else None, image, where)
+        notes += _told_lenses(chosen, views)
         aligned = align(views, where)
         organised = aligned.cloud_m.shape[0] > 1
         if aligned.note:
@@ -206,6 +207,17 @@ def _picture(chosen: Chosen, shot: StampedMessage | None) -> tuple[NDArray[np.ui
         return picture(shot.fields, chosen.image.schema, chosen.image.name), notes
     except CaptureError as problem:
         return None, [*notes, f"frame without its picture: {problem}"]
+
+
+def _told_lenses(chosen: Chosen, views: Views) -> list[str]:
+    """What is to be told of images that are called rectified and have a lens all the same."""
+    cameras = {chosen.source.base_name: views.source_camera if views.is_depth else None}
+    if chosen.image is not None:
+        cameras[chosen.image.base_name] = views.image_camera
+    named = [name for name, camera in cameras.items() if is_rectified(name) and camera is not None and camera.model]
+    return [
+        f"{name} is called rectified, but its D is not zero and its P equals K: its lens was removed" for name in named
+    ]
 
 
 def _camera(

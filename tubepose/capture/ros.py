@@ -141,7 +141,8 @@ def depth_image(message: Any, schema: str, where: str, metres_per_count: float, 
         data = bytes(message.data)
         if is_compressed_depth(message.format):
             return decode_compressed_depth(message.format, data, where, metres_per_count, metres_per_number)
-        return depth_to_metres(depth_counts(decode(data, where), where), metres_per_count)
+        pixels = depth_counts(decode(data, where), where)
+        return depth_to_metres(pixels, metres_per_number if pixels.dtype.kind == "f" else metres_per_count)
     layout = _layout(message, where)
     if layout.channels != 1 or layout.conversion is not None or layout.kind == "u1":
         raise CaptureError(
@@ -155,6 +156,16 @@ def depth_image(message: Any, schema: str, where: str, metres_per_count: float, 
 def is_calibrated(info: Any) -> bool:
     """Whether a CameraInfo holds a camera: a size, and K or P with what a camera can have (no zeros, no identity)."""
     return any(_pinhole(info, np.asarray(rows, dtype=float).reshape(3, -1)) for rows in (info.k, info.p))
+
+
+def same_camera(one: Any, other: Any) -> bool:
+    """Whether two CameraInfos say the same of the camera, whatever their stamps."""
+    return all(
+        np.array_equal(np.asarray(getattr(one, name)), np.asarray(getattr(other, name)))
+        for name in ("k", "d", "p", "r", "width", "height", "distortion_model", "binning_x", "binning_y")
+    ) and all(
+        getattr(one.roi, name) == getattr(other.roi, name) for name in ("x_offset", "y_offset", "width", "height")
+    )
 
 
 def _pinhole(info: Any, matrix: FloatArray) -> bool:

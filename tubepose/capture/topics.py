@@ -11,7 +11,7 @@ from typing import Any
 from tubepose.capture.compressed_depth import is_compressed_depth
 from tubepose.capture.images import is_depth_png
 from tubepose.capture.message_types import CAMERA_INFO, COMPRESSED_IMAGE, IMAGE, POINT_CLOUD
-from tubepose.capture.ros import DEPTH_ENCODINGS, is_calibrated
+from tubepose.capture.ros import DEPTH_ENCODINGS, is_calibrated, same_camera
 from tubepose.errors import CaptureError
 
 # What image_transport adds to a topic's name for its compressed twin.
@@ -65,15 +65,16 @@ class Topic:
     infos: list[tuple[int, Any]] = field(default_factory=list)
 
     def note_info(self, stamp_ns: int | None, info: Any) -> None:
-        """Keep a CameraInfo with its stamp; one that is not calibrated says nothing."""
-        if is_calibrated(info):
+        """Keep a CameraInfo with its stamp where it tells something new; one that is not calibrated says nothing."""
+        if is_calibrated(info) and not (self.infos and same_camera(self.infos[-1][1], info)):
             self.infos.append((stamp_ns or 0, info))
 
     @property
     def is_depth(self) -> bool:
         """True for an image that holds depth by its encoding, or by its name if its encoding is a 16-bit picture's."""
         if self.schema == COMPRESSED_IMAGE:
-            return self.is_compressed_depth or (self._says_depth and is_depth_png(self.first.data))
+            told = self.first.format.startswith(DEPTH_ENCODINGS) or is_depth_png(self.first.data)
+            return self.is_compressed_depth or (self._says_depth and told)
         if self.schema != IMAGE:
             return False
         return self.first.encoding in DEPTH_ENCODINGS or (self.first.encoding in _COUNTS and self._says_depth)

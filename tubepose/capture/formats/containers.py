@@ -25,6 +25,8 @@ SUFFIXES = (".mcap", ".db3", ".bag")
 """Endings of recordings; each may be followed by one of `COMPRESSED`."""
 COMPRESSED = (".zstd", ".zst")
 METADATA_FILE = "metadata.yaml"
+# What rosbag leaves behind the name of a bag that was not closed.
+_UNFINISHED = ".active"
 
 _INFORMATION = "rosbag2_bagfile_information"
 _START_BYTES = 16
@@ -42,7 +44,7 @@ def is_recording(path: Path) -> bool:
 def recording_suffix(path: Path) -> str:
     """Ending of a recording's name in small letters, without that of its compression."""
     suffix = path.suffix.lower()
-    return Path(path.stem).suffix.lower() if suffix in COMPRESSED else suffix
+    return Path(path.stem).suffix.lower() if suffix in (*COMPRESSED, _UNFINISHED) else suffix
 
 
 def read_raw(path: Path) -> Iterator[RawMessage | Note]:
