@@ -102,7 +102,7 @@ class PixelCamera:
         """A picture (H, W) or (H, W, 3) in the pinhole camera's pixels, between pixels linearly; black outside."""
         if self.model is None:
             return picture
-        seen = np.nan_to_num(_recorded_px(self), nan=-1e4).astype(np.float32)
+        seen = np.clip(np.nan_to_num(_recorded_px(self), nan=-1e4), -1e4, 1e5).astype(np.float32)
         return np.asarray(cv2.remap(picture, seen[..., 0], seen[..., 1], cv2.INTER_LINEAR), dtype=np.uint8)
 
     def _pixels(self, normalised: FloatArray) -> FloatArray:

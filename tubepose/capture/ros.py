@@ -35,7 +35,8 @@ def cloud_arrays(message: Any, where: str) -> tuple[FloatArray, NDArray[np.uint8
         raise CaptureError(
             f"{where}: expected the fields x, y and z in a PointCloud2, found {', '.join(fields) or 'none'}"
         )
-    xyz = np.stack([_field(message, fields[axis], where).astype(np.float64) for axis in "xyz"], axis=-1)
+    with np.errstate(invalid="ignore"):  # some NaN are told of when they are cast
+        xyz = np.stack([_field(message, fields[axis], where).astype(np.float64) for axis in "xyz"], axis=-1)
     packed = fields.get("rgb") or fields.get("rgba")
     channels = [fields[name] for name in ("red", "green", "blue") if name in fields and fields[name].datatype == 2]
     if len(channels) == 3:

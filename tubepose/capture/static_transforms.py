@@ -13,6 +13,9 @@ from tubepose.transforms import FloatArray, invert_transform, make_transform
 # Two messages of one transform that differ by more tell a moving frame.
 _STILL_M = 1e-4
 _STILL_TURN = 1e-4
+# Numbers of a transform that was never set, or is none.
+_MOST = 1e6
+_LEAST_TURN = 1e-6
 
 
 class StaticTransforms:
@@ -67,10 +70,11 @@ class StaticTransforms:
 
 
 def matrix_of(transform: Any) -> FloatArray | None:
-    """A `geometry_msgs/Transform` as (4, 4) matrix, metres; None for one without a rotation or with NaN."""
+    """A `geometry_msgs/Transform` as (4, 4) matrix, metres; None for one without a rotation, with NaN, or beyond any lab."""
     turn, shift = transform.rotation, transform.translation
     quaternion = np.array([turn.x, turn.y, turn.z, turn.w], dtype=float)
     translation = np.array([shift.x, shift.y, shift.z], dtype=float)
-    if not (np.isfinite(quaternion).all() and np.isfinite(translation).all()) or np.linalg.norm(quaternion) < 1e-6:
+    numbers = np.concatenate([quaternion, translation])
+    if not (np.abs(numbers) < _MOST).all() or np.linalg.norm(quaternion) < _LEAST_TURN:
         return None
     return make_transform(Rotation.from_quat(quaternion).as_matrix(), translation)

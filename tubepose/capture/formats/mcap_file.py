@@ -25,7 +25,7 @@ from tubepose.capture.formats.raw_messages import (
 )
 
 # What a cut or damaged file makes mcap and its decompressors raise (lz4: RuntimeError; checksums and text: ValueError).
-_BROKEN = (McapError, zstandard.ZstdError, struct.error, ValueError, RuntimeError, MemoryError)
+_BROKEN = (McapError, zstandard.ZstdError, struct.error, ValueError, RuntimeError, MemoryError, OverflowError)
 _NO_SCHEMA = Schema(id=0, name="messages without a schema", encoding="", data=b"")
 
 
