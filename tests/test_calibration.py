@@ -94,6 +94,20 @@ def test_models_are_told_by_their_name_and_others_are_refused():
         camera_of(info(d=BROWN, distortion_model="ftheta"), rectified=False)
 
 
+def test_a_lens_that_is_not_read_leaves_a_cloud_with_its_pixels(tmp_path):
+    unknown = info_message(changes={"d": BROWN, "distortion_model": "ftheta"})
+    messages = [
+        ("/points", POINT_CLOUD, cloud_message(CAMERA.backproject(DEPTH))),
+        ("/color/image_raw", IMAGE, image_message(GRAY, "mono8")),
+        ("/color/camera_info", CAMERA_INFO, unknown),
+    ]
+    (frame,) = read_all(mcap(tmp_path / "a.mcap", messages))
+    assert_same(frame)
+    depth = [("/depth/image_raw", IMAGE, image_message(DEPTH, "32FC1")), *messages[1:]]
+    with pytest.raises(CaptureError, match="message 1: a lens of the model 'ftheta' with 5 coefficients is not read"):
+        read_all(mcap(tmp_path / "b.mcap", depth))
+
+
 # Binning and region of interest --------------------------------------------------------------------------------------
 
 

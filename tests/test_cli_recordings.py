@@ -66,9 +66,7 @@ def sample_frame():
     return next(iter(open_captures(sorted(folder.glob("*original*"))[0])[0].frames()))
 
 
-@pytest.mark.parametrize(
-    ("factor", "hint"), [(10, "--depth-scale, 0.1 times"), (1000, "--unit m or mm; ")]
-)
+@pytest.mark.parametrize(("factor", "hint"), [(10, "--depth-scale, 0.1 times"), (1000, "--unit m or mm; ")])
 def test_the_scale_that_a_wrong_unit_asks_for_works(tmp_path, sample_frame, factor, hint):
     """Depth in counts of 0.1 mm, or in floats of millimetres."""
     rack = load_rack(RACK)

@@ -14,6 +14,7 @@ from recordings import (
     SECOND_NS,
     STAMP_NS,
     assert_same,
+    cdr,
     cloud_message,
     cloud_shots,
     header,
@@ -255,6 +256,24 @@ def test_what_is_passed_over_beside_a_cloud_is_told_and_the_option_works(tmp_pat
 def test_scales_of_recorded_depth(tmp_path, depth, encoding, options):
     (frame,) = read_all(mcap(tmp_path / "a.mcap", shots(encoding=encoding, depth=depth)), **options)
     np.testing.assert_allclose(frame.cloud_m[..., 2], DEPTH, atol=0.51e-3)
+
+
+def test_a_video_beside_a_cloud_is_named(tmp_path):
+    from mcap.writer import Writer
+
+    mcap(tmp_path / "made.mcap", cloud_shots()[:1])
+    with (tmp_path / "a.mcap").open("wb") as stream:
+        writer = Writer(stream)
+        writer.start()
+        for topic, schema, encoding, data in (
+            ("/points", POINT_CLOUD, "cdr", cdr(*cloud_shots()[0][1:])),
+            ("/video", "foxglove.CompressedVideo", "protobuf", b"\x00"),
+        ):
+            number = writer.register_schema(schema, "ros2msg", b"")
+            writer.add_message(writer.register_channel(topic, encoding, number), 1, data, 1)
+        writer.finish()
+    (frame,) = read_all(tmp_path / "a.mcap")
+    assert frame.notes == ("no picture: not read: /video (foxglove.CompressedVideo)",)
 
 
 def test_a_depth_scale_is_of_depth_and_not_of_clouds(tmp_path):

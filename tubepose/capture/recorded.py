@@ -11,9 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tubepose.capture.alignment import Views, align
-from tubepose.capture.calibration import camera_at, info_at, is_rectified
 from tubepose.capture.description import Unit
 from tubepose.capture.frame import RgbdFrame
+from tubepose.capture.frame_cameras import depth_camera, optional_camera, picture_camera, told_lenses
 from tubepose.capture.lens import PixelCamera
 from tubepose.capture.message_types import POINT_CLOUD
 from tubepose.capture.pairing import PAIRING_TOLERANCE_NS, pair_by_stamp
@@ -92,7 +92,7 @@ class RecordedCapture:
             raise CaptureError(message.problem)
         image, notes = _picture(chosen, shot)
         views, colours = self._views(recording, chosen, message, shot if image is not None else None, image, where)
-        notes += _told_lenses(chosen, views)
+        notes += told_lenses(chosen, views)
         aligned = align(views, where)
         organised = aligned.cloud_m.shape[0] > 1
         if aligned.note:
@@ -120,7 +120,7 @@ class RecordedCapture:
         where: str,
     ) -> tuple[Views, NDArray[np.uint8] | None]:
         """Both views of a moment, and the colours of a cloud that has its own."""
-        image_camera = _picture_camera(chosen, shot, image, where)
+        image_camera = picture_camera(chosen, shot, image, where)
         is_depth = chosen.source.schema != POINT_CLOUD
         colours, source_camera = None, None
         frame_id = _frame_id(recording, chosen.source, message)
@@ -128,7 +128,7 @@ class RecordedCapture:
             cloud, source_camera = self._depth_cloud(recording, chosen, message, image_camera, where)
         else:
             cloud, colours = self._point_cloud(message, where)
-            source_camera = _camera(chosen.source_info, chosen.source, message, _pixels_of(cloud), where)
+            source_camera = optional_camera(chosen.source_info, chosen.source, message, _pixels_of(cloud), where)
         shot_frame = _frame_id(recording, chosen.image, shot) if shot is not None and chosen.image is not None else ""
         if not shot_frame:
             info = chosen.image_info if image is not None else chosen.source_info
@@ -170,12 +170,7 @@ class RecordedCapture:
         """Points of a depth image (H, W, 3) in the pixels as they were recorded, and its camera."""
         count_m, number_m = self._depth_scales(recording, chosen.source.name, where)
         depth = depth_image(message.fields, chosen.source.schema, where, count_m, number_m)
-        size = (depth.shape[0], depth.shape[1])
-        camera = _camera(chosen.source_info, chosen.source, message, size, where)
-        if camera is None and image_camera is not None and _same_frame(chosen, message):
-            camera = _if_size(image_camera, size)  # aligned depth whose own CameraInfo is of another resolution
-        if camera is None:
-            raise CaptureError(_no_camera_text(chosen, size, where))
+        camera = depth_camera(chosen, message, image_camera, (depth.shape[0], depth.shape[1]), where)
         return camera.backproject(depth), camera
 
     def _depth_scales(self, recording: Recording, topic: str, where: str) -> tuple[float, float]:
@@ -207,77 +202,6 @@ def _picture(chosen: Chosen, shot: StampedMessage | None) -> tuple[NDArray[np.ui
         return picture(shot.fields, chosen.image.schema, chosen.image.name), notes
     except CaptureError as problem:
         return None, [*notes, f"frame without its picture: {problem}"]
-
-
-def _told_lenses(chosen: Chosen, views: Views) -> list[str]:
-    """What is to be told of images that are called rectified and have a lens all the same."""
-    cameras = {chosen.source.base_name: views.source_camera if views.is_depth else None}
-    if chosen.image is not None:
-        cameras[chosen.image.base_name] = views.image_camera
-    named = [name for name, camera in cameras.items() if is_rectified(name) and camera is not None and camera.model]
-    return [
-        f"{name} is called rectified, but its D is not zero and its P equals K: its lens was removed" for name in named
-    ]
-
-
-def _camera(
-    info: Topic | None, topic: Topic, message: StampedMessage, size: tuple[int, int] | None, where: str
-) -> PixelCamera | None:
-    try:
-        return camera_at(info, topic, message.stamp_ns, size)
-    except CaptureError as problem:
-        raise CaptureError(f"{where}: {problem}") from None
-
-
-def _picture_camera(
-    chosen: Chosen, shot: StampedMessage | None, image: NDArray[np.uint8] | None, where: str
-) -> PixelCamera | None:
-    """Camera of the picture; None for one that is not calibrated.
-
-    Raises:
-        CaptureError: There is a calibration, but for another size.
-    """
-    if image is None or shot is None or chosen.image is None:
-        return None
-    size = (image.shape[0], image.shape[1])
-    camera = _camera(chosen.image_info, chosen.image, shot, size, where)
-    if camera is None and chosen.image_info is not None:
-        _refuse_size(chosen.image_info, f"image of {chosen.image.name}", size, shot.stamp_ns, where)
-    return camera
-
-
-def _refuse_size(info: Topic, what: str, size: tuple[int, int], stamp_ns: int | None, where: str) -> None:
-    """Say so where a topic has CameraInfos, but none for an image's size."""
-    other = info_at(info, stamp_ns, None)
-    if other is not None and info_at(info, stamp_ns, size) is None:
-        raise CaptureError(
-            f"{where}: the {what} is {size[1]} x {size[0]} pixels, its CameraInfo {other.width} x {other.height}; "
-            "name the one that fits with --info-topic"
-        )
-
-
-def _no_camera_text(chosen: Chosen, size: tuple[int, int], where: str) -> str:
-    info = chosen.source_info
-    if info is not None:
-        other = info_at(info, None, None)
-        if other is not None and (int(other.height), int(other.width)) != size:
-            return (
-                f"{where}: the depth image is {size[1]} x {size[0]} pixels, its CameraInfo {other.width} x "
-                f"{other.height}; name the one that fits with --info-topic"
-            )
-    found = "none" if info is None else f"{info.name}, without calibration (zeros, or numbers that no camera has)"
-    return (
-        f"{where}: a depth image needs the CameraInfo of its camera, found {found}; record it with the depth, or "
-        "name it with --info-topic"
-    )
-
-
-def _if_size(camera: PixelCamera, size: tuple[int, int]) -> PixelCamera | None:
-    return camera if (camera.pinhole.height, camera.pinhole.width) == size else None
-
-
-def _same_frame(chosen: Chosen, message: StampedMessage) -> bool:
-    return chosen.image is not None and chosen.image.frame_id == str(message.fields.header.frame_id)
 
 
 def _pixels_of(cloud: FloatArray) -> tuple[int, int] | None:

@@ -70,7 +70,7 @@ class StaticTransforms:
 
 
 def matrix_of(transform: Any) -> FloatArray | None:
-    """A `geometry_msgs/Transform` as (4, 4) matrix, metres; None for one without a rotation, with NaN, or beyond any lab."""
+    """A `geometry_msgs/Transform` as (4, 4) matrix, metres; None for one that was never set."""
     turn, shift = transform.rotation, transform.translation
     quaternion = np.array([turn.x, turn.y, turn.z, turn.w], dtype=float)
     translation = np.array([shift.x, shift.y, shift.z], dtype=float)

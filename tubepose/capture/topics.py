@@ -22,7 +22,9 @@ _PICTURE = ("color", "colour", "rgb", "texture")
 # Words of pictures whose encoding could be depth, too; whole words, as "ir" is part of many.
 _GRAY_WORDS = {"texture", "ir", "infra", "intensity", "amplitude", "gray", "grey", "mono", "color", "colour", "rgb"}
 # Encodings of depth, if the name says so.
-_COUNTS = ("mono16", "16SC1")
+_COUNTS = ("mono16", "16SC1", "64FC1")
+# Words of types that hold pictures, whether they are read or not.
+_PICTURE_TYPES = ("image", "video", "ffmpeg")
 _MOST_TOLD = 8
 
 
@@ -90,11 +92,6 @@ class Topic:
         if self.schema == COMPRESSED_IMAGE:
             return self.is_depth or is_depth_png(self.first.data)
         return self.is_depth or (self.schema == IMAGE and self.first.encoding in _COUNTS)
-
-    @property
-    def is_picture(self) -> bool:
-        """True for any other image."""
-        return self.is_image and not self.is_depth
 
     @property
     def is_image(self) -> bool:
@@ -169,7 +166,7 @@ def choose_topics(
             f"{where}: --image-topic {image.name} is the depth that the frames are made of; name a picture instead"
         )
     info = _pick(found, asked.info, lambda t: t.schema == CAMERA_INFO, "info", where) if asked.info else None
-    notes = () if image is not None else _passed_over(found, source)
+    notes = () if image is not None else _passed_over(found, source, unread or {})
     return Chosen(
         source, image, info or _info_of(source, found), (info or _info_of(image, found)) if image else None, notes
     )
@@ -184,17 +181,19 @@ def told_types(types: Mapping[str, str]) -> str:
 
 def _may_be_picture(topic: Topic, source: Topic) -> bool:
     """Beside a point cloud an image of floats or 16 bits named texture, ir or the like is a picture."""
-    if topic is source:
+    if topic is source or not topic.is_image:
         return False
-    return topic.is_picture or (source.schema == POINT_CLOUD and topic.is_image and topic.is_gray_by_name)
+    return not topic.is_depth or (source.schema == POINT_CLOUD and topic.is_gray_by_name)
 
 
-def _passed_over(found: dict[str, Topic], source: Topic) -> tuple[str, ...]:
+def _passed_over(found: dict[str, Topic], source: Topic, unread: Mapping[str, str]) -> tuple[str, ...]:
+    """What to tell of a recording without a picture: images that were not taken for one, and videos."""
     others = {t.name: getattr(t.first, "encoding", "") or t.first.format for t in found.values() if t.is_image}
     others = {name: form for name, form in others.items() if found[name].base_name != source.base_name}
-    if not others:
-        return ()
-    return (f"no picture: passed over {told_types(others)}; --image-topic names one",)
+    videos = {name: kind for name, kind in unread.items() if any(word in kind.lower() for word in _PICTURE_TYPES)}
+    told = [f"passed over {told_types(others)}; --image-topic names one"] if others else []
+    told += [f"not read: {told_types(videos)}"] if videos else []
+    return (f"no picture: {'; '.join(told)}",) if told else ()
 
 
 def _source(found: dict[str, Topic], asked: TopicChoice, where: str, unread: Mapping[str, str]) -> Topic:
