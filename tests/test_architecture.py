@@ -59,6 +59,8 @@ ALLOWED: dict[str, set[str]] = {
     "stage_times": set(),
     "tubes_pitch": {"checks", "config", "labware", "rack", "scene", "statistics", "tube"},
     "labware_check": {"config", "labware", "rack", "scene", "statistics", "tubes_pitch"},
+    "standing_tops": {"labware"},
+    "labware_measure": {"capture", "config", "labware", "rack", "sensor", "standing_tops"},
     "result_tables": {"labware", "records"},
     "records": {"capture", "checks", "occupancy", "pipeline", "pose_errors", "rack", "sensor"},
     "batch": {
