@@ -26,9 +26,9 @@ from tubepose.config import Config, IcpConfig, Objective, RivalsConfig, TubeConf
 from tubepose.detection.geometric import GeometricDetector
 from tubepose.evaluation import evaluate, summarise
 from tubepose.ground_truth import GroundTruthConfig
+from tubepose.methods import require_methods
 from tubepose.provenance import pinned_threads
 from tubepose.records import ESTIMATE_COLUMNS, to_table
-from tubepose.rivals import require_packages
 from tubepose.truth_tables import TRUTH_COLUMNS, TruthTables, measure_session, with_exact_rack
 
 SEEDS = 2
@@ -158,7 +158,7 @@ def main() -> None:
     if which not in GROUPS or not folders:
         sys.exit(__doc__)
     method, settings = GROUPS[which]
-    require_packages([method])
+    require_methods([method])
     sessions = [load_session(Path(folder)) for folder in folders]
     with pinned_threads(1):
         table = compare(sessions, method, settings(), known_rack=known_rack)

@@ -21,9 +21,11 @@ from benchmarks.wrong_labware_judging import Truth
 from tubepose.confidence import within
 from tubepose.config import Config
 from tubepose.detection.geometric import GeometricDetector
-from tubepose.pipeline import DEFAULT_METHOD, TubeEstimate, estimate_tubes, prepare_scene
+from tubepose.methods import DEFAULT_METHOD
+from tubepose.pipeline import estimate_tubes, prepare_scene
 from tubepose.pose_errors import pose_errors
 from tubepose.provenance import pinned_threads
+from tubepose.scene import TubeEstimate
 
 BINS = (0.0, 0.5, 0.8, 0.9, 0.95, 0.99, 0.999, 1.0)
 
@@ -51,7 +53,7 @@ def answers(noise_mm: float, seed: int, number: int) -> list[tuple[float, bool, 
     config = Config()
     detector = GeometricDetector(truth.rack, types, config)
     scene = prepare_scene(noisy, truth.rack, types, detector, config, methods=(DEFAULT_METHOD,))
-    found, _ = estimate_tubes(scene, DEFAULT_METHOD, config)
+    found = estimate_tubes(scene, DEFAULT_METHOD, config).estimates
     posed = [e for e in found if e.T_camera_tube is not None and e.pose.covariance is not None and truth.tubes]
     return [(e.pose.confidence, judged(truth, e), e.pose.status.value == "ok") for e in posed]
 

@@ -25,7 +25,7 @@ from tubepose.capture.frame import RgbdFrame
 from tubepose.capture.manifest import Split
 from tubepose.capture.session import Session, is_session, load_session
 from tubepose.config import Config
-from tubepose.detection import Detection
+from tubepose.detection import Detection, Detector
 from tubepose.detection.assisted import AssistedDetector
 from tubepose.detection.bundled import bundled_model
 from tubepose.detection.geometric import GeometricDetector
@@ -34,7 +34,7 @@ from tubepose.errors import ConfigError, TubePoseError
 from tubepose.evaluation import evaluate, summarise
 from tubepose.labware import load_cap, load_rack, load_tube
 from tubepose.labware.reading import read_yaml, validate
-from tubepose.pipeline import METHODS, TUBE_METHODS
+from tubepose.methods import METHODS
 from tubepose.provenance import pinned_threads
 from tubepose.records import ESTIMATE_COLUMNS, to_table
 from tubepose.simulation import simulate_session
@@ -122,7 +122,7 @@ def make(plan: Plan, place: Path, threads: int, recipe: Path = RECIPE) -> None:
         print(f"{name}: done", file=sys.stderr, flush=True)
 
 
-class NoBoxes:
+class NoBoxes(Detector):
     """A detector for methods that need none, where the rack's pose is known as well."""
 
     name = "recorded"
@@ -138,7 +138,7 @@ def judge(
     """Rows of errors.csv of a session by its exact truth, and how many racks of how many were accepted."""
     jobs, problems = session_jobs(session)
     jobs = with_exact_rack(jobs, session) if known_rack else jobs
-    boxes = not known_rack or any(method in TUBE_METHODS for method in methods)
+    boxes = not known_rack or any(METHODS[name].needs_targets for name in methods)
     yolo = YoloDetector(bundled_model(), threads=1) if boxes else None
     tables = run_jobs(
         jobs,

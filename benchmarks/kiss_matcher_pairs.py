@@ -3,7 +3,8 @@
     python -m benchmarks.kiss_matcher_pairs SESSION...   # simulated sessions; the rack's pose is the exact one
 
 Prints, per tube and setting: points of scan and template, pairs that its matcher keeps, pairs after pruning (means).
-This is why `tubepose.rivals` pairs features itself: the matcher's ratio test cannot be turned off from Python.
+This is why `tubepose.methods.kiss_matcher` pairs features itself: the matcher's ratio test cannot be
+turned off from Python.
 """
 
 from __future__ import annotations
@@ -16,12 +17,12 @@ import kiss_matcher
 import numpy as np
 from scipy.spatial import cKDTree
 
-from tubepose.baselines import visible_template
 from tubepose.batch import session_jobs
 from tubepose.capture.session import load_session
 from tubepose.config import Config
 from tubepose.detection.geometric import GeometricDetector
 from tubepose.labware import TubeModel
+from tubepose.methods.visible_template import visible_template
 from tubepose.pipeline import prepare_scene
 from tubepose.preprocessing import remove_outliers, voxel_downsample
 from tubepose.provenance import pinned_threads

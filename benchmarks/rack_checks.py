@@ -3,20 +3,25 @@
     python -m benchmarks.rack_checks [--frames N] [--seed S] [--set choose|report] [--per-kind N] [--frame-folder DIR]
 
 The SIMULATED frames and the files are those of `benchmarks.wrong_labware`. Per check: the value nearest to refusal (the
-largest share of its limit) with right files, how many right files it refused, how many wrong files it refused, and how
-many of those no other check refused. A check that refuses no wrong file alone could go.
+largest share of its limit) with right files, how many right files it refused, how many wrong files it refused, how many
+of those no other check refused, and how many of these are accepted once the check is removed: quick checks spare the
+others, which would have refused most of them. A check without which nothing wrong is accepted could go.
 """
 
 from __future__ import annotations
 
 import argparse
 from collections import defaultdict
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 
 from benchmarks.wrong_labware_cases import KINDS, cases
 from benchmarks.wrong_labware_scenes import SETS, view
-from tubepose.checks import Check, failed
+from tubepose import checks
+from tubepose.checks import Check
 from tubepose.config import Config
 from tubepose.provenance import pinned_threads
 from tubepose.rack import RackPose, RackStatus, register_rack
@@ -35,12 +40,14 @@ class Decided:
         right: Right files that it refused.
         wrong: Wrong files that it refused.
         alone: Of these, those that no other check refused.
+        needed: Of these, those that are accepted without it.
     """
 
     worst: tuple[float, float] | None = None
     right: int = 0
     wrong: int = 0
     alone: int = 0
+    needed: int = 0
 
 
 @dataclass(slots=True)
@@ -51,23 +58,37 @@ class Decisions:
     n_right: int = 0
     n_wrong: int = 0
 
-    def add(self, pose: RackPose, right: bool) -> None:
-        """Count one answer."""
+    def add(self, pose: RackPose, right: bool, again: Callable[[], RackPose]) -> None:
+        """Count one answer; `again` asks the same once more."""
         self.n_right += right
         self.n_wrong += not right
-        codes = {check.code for check in failed(pose.checks)}
+        codes = {check.code for check in checks.failed(pose.checks)}
         if pose.status is not RackStatus.OK and not codes:
             codes = {NO_CHECK}
         for code in codes:
             decided = self.by_code[code]
             decided.right += right
             decided.wrong += not right
-            decided.alone += not right and len(codes) == 1
+            if not right and len(codes) == 1:
+                decided.alone += 1
+                with removed(code):
+                    decided.needed += again().status is RackStatus.OK
         if right:
             for check in pose.checks:
                 decided = self.by_code[check.code]
                 if check.decides and (decided.worst is None or nearness(check) > nearness_of(check, decided.worst)):
                     decided.worst = (check.value, check.limit)
+
+
+@contextmanager
+def removed(code: str) -> Iterator[None]:
+    """Answers as they would be without one check."""
+    refusing = checks.failed
+    checks.failed = lambda some: refusing(check for check in some if check.code != code)
+    try:
+        yield
+    finally:
+        checks.failed = refusing
 
 
 def nearness(check: Check) -> float:
@@ -88,12 +109,13 @@ def table(found: Decisions) -> str:
     lines = [
         f"{found.n_right} right files, {found.n_wrong} wrong ones. SIMULATED.",
         "",
-        "| check | right files: nearest value, limit | refused right | refused wrong | of these alone |",
-        "|---|---|--:|--:|--:|",
+        "| check | right files: nearest value, limit | refused right | refused wrong | of these alone | accepted "
+        "without it |",
+        "|---|---|--:|--:|--:|--:|",
     ]
     for code, decided in sorted(found.by_code.items(), key=lambda item: -item[1].wrong):
         worst = "-" if decided.worst is None else f"{decided.worst[0]:.3g}, {decided.worst[1]:.3g}"
-        lines.append(f"| {code} | {worst} | {decided.right} | {decided.wrong} | {decided.alone} |")
+        lines.append(f"| {code} | {worst} | {decided.right} | {decided.wrong} | {decided.alone} | {decided.needed} |")
     return "\n".join(lines)
 
 
@@ -112,8 +134,8 @@ def main() -> None:
         for number in range(options.frames):
             seen = view(options.chosen, options.seed, number, "raycast", options.frame_folder)
             for case in cases(seen, kinds, options.per_kind, options.seed):
-                pose = register_rack(case.frame.measured_m, case.rack, Config())
-                found.add(pose, right=case.kind == "right")
+                ask = partial(register_rack, case.frame.measured_m, case.rack, Config())
+                found.add(ask(), case.kind == "right", ask)
     print(table(found))
 
 

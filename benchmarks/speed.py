@@ -27,13 +27,14 @@ from tubepose.batch import Job, session_jobs
 from tubepose.capture.frame import RgbdFrame
 from tubepose.capture.session import load_session
 from tubepose.config import Config
-from tubepose.detection import Detection
+from tubepose.detection import Detection, Detector
 from tubepose.detection.geometric import GeometricDetector
 from tubepose.errors import CaptureError, ConfigError, TubePoseError
-from tubepose.pipeline import METHODS, Scene, TubeEstimate, estimate_tubes, prepare_scene
+from tubepose.methods import METHODS, require_methods
+from tubepose.pipeline import estimate_tubes, prepare_scene
 from tubepose.provenance import machine, pinned_threads
 from tubepose.rack import RackStatus
-from tubepose.rivals import PACKAGES, require_packages
+from tubepose.scene import Scene, TubeEstimate
 from tubepose_cli.inputs import sample_session
 
 TIMED = (OURS, "paper", "slot-icp", "global-icp", "kiss-matcher", "gicp")
@@ -41,7 +42,7 @@ _ONE_THREAD = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "TB
 
 
 @dataclass(frozen=True, slots=True)
-class Boxes:
+class Boxes(Detector):
     """A source of boxes that were found before, so that detection takes no time."""
 
     found: tuple[Detection, ...]
@@ -106,10 +107,10 @@ def known_tubes(estimates: Sequence[TubeEstimate]) -> int:
 
 def time_tube(one: Timed, target: int, method: str, config: Config, seed: int) -> float:
     """Milliseconds of a method for one tube; `profile`, which does all at once, is shared out among them."""
-    scene = one.scene if method == OURS else replace(one.scene, targets=(one.scene.targets[target],))
+    scene = replace(one.scene, targets=(one.scene.targets[target],))
     start = time.perf_counter_ns()
-    estimates, _ = estimate_tubes(scene, method, config, seed)
-    return (time.perf_counter_ns() - start) / 1e6 / (known_tubes(estimates) if method == OURS else 1)
+    estimates = estimate_tubes(scene, method, config, seed).estimates
+    return (time.perf_counter_ns() - start) / 1e6 / (1 if METHODS[method].needs_targets else known_tubes(estimates))
 
 
 def time_rack(one: Timed, method: str, config: Config) -> Row:
@@ -126,7 +127,7 @@ def time_frame(one: Timed, config: Config) -> Iterator[Row]:
     scene = one.prepared(config)
     middle = time.perf_counter_ns()
     with timed_stages() as spent:
-        estimates, _ = estimate_tubes(scene, OURS, config)
+        estimates = estimate_tubes(scene, OURS, config).estimates
     end = time.perf_counter_ns()
     tubes = {"tubes": known_tubes(estimates)}
     yield {"part": "frame", "name": "rack + profile", "ms": (end - start) / 1e6, **tubes}
@@ -183,7 +184,7 @@ def measure_all(frames: Sequence[Timed], options: argparse.Namespace, out: Path)
     bytes_per_s = bandwidth(options.megabytes)
     for one in frames:
         trial = one.job.trial
-        least = bound(one.scene, estimate_tubes(one.scene, OURS, config)[0], bytes_per_s)
+        least = bound(one.scene, estimate_tubes(one.scene, OURS, config).estimates, bytes_per_s)
         of = table[(table["part"] == "frame") & (table["frame"] == trial)].set_index("name")["median_ms"]
         yield bound_line(trial, tubes[trial], least, of["profile"], of["rack + profile"])
         rows = [{"part": "bound", "frame": trial, "name": name, "value": value} for name, value in least.items()]
@@ -220,7 +221,7 @@ def parser() -> argparse.ArgumentParser:
 def read_methods(text: str | None) -> list[str]:
     """Methods to time, `profile` first; by default those whose packages are installed."""
     if text is None:
-        return [name for name in TIMED if all(find_spec(package) for package in PACKAGES.get(name, ()))]
+        return [name for name in TIMED if all(find_spec(package) for package in METHODS[name].packages)]
     names = text.split(",")
     if unknown := [name for name in names if name not in METHODS]:
         raise ConfigError(f"unknown method '{unknown[0]}'; known methods: {', '.join(METHODS)}")
@@ -235,7 +236,7 @@ def main(arguments: list[str] | None = None) -> int:
         if min(options.rounds, options.tubes, options.megabytes) < 1:
             raise ConfigError("--rounds, --tubes and --megabytes: expected 1 or more")
         one_core()
-        require_packages(options.methods)
+        require_methods(options.methods)
         with pinned_threads(1):
             frames = fullest_frames(options.session, Config())
             for line in measure_all(frames, options, options.out):

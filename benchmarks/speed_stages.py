@@ -12,8 +12,8 @@ from unittest.mock import patch
 
 import numpy as np
 
-from tubepose.pipeline import Scene, TubeEstimate
 from tubepose.profile import closed_tops, estimate, fusing, measure
+from tubepose.scene import Scene, TubeEstimate
 from tubepose.transforms import transform_points
 
 STAGES: dict[str, tuple[ModuleType, tuple[str, ...]]] = {

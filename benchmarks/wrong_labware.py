@@ -34,11 +34,12 @@ from benchmarks.wrong_labware_scenes import SETS, View, view
 from tubepose.config import Config
 from tubepose.detection.geometric import GeometricDetector
 from tubepose.errors import TubePoseError
-from tubepose.pipeline import DEFAULT_METHOD, Scene, estimate_tubes, prepare_scene
+from tubepose.methods import DEFAULT_METHOD
+from tubepose.pipeline import estimate_tubes, prepare_scene
 from tubepose.provenance import pinned_threads
 from tubepose.records import estimate_row, rack_row, slot_rows
+from tubepose.scene import Scene
 from tubepose.simulation import SENSORS
-from tubepose.tubes_pitch import refuse_by_tops
 
 FULL_FRAMES = 500
 MOST_WORKERS = 2
@@ -68,10 +69,10 @@ def ask(case: Case, config: Config) -> tuple[Answer, Row]:
     detector = GeometricDetector(case.rack, case.tubes, config)
     try:
         scene = prepare_scene(case.frame, case.rack, case.tubes, detector, config, methods=(DEFAULT_METHOD,))
-        estimates, _ = estimate_tubes(scene, DEFAULT_METHOD, config)
-        scene, estimates = refuse_by_tops(scene, estimates, config)
+        result = estimate_tubes(scene, DEFAULT_METHOD, config)
     except TubePoseError as refusal:
         return Answer(case.rack, None, False, str(refusal)), {"resolved_by": "error"}
+    scene, estimates = result.scene, result.estimates
     rack = rack_row(scene)
     slots = slot_rows({}, DEFAULT_METHOD, scene, estimates)
     tubes = [
@@ -187,7 +188,8 @@ def _right_words(right: Sequence[Row]) -> str:
     return (
         f"With the right file: {count('racks')} of {len(right)} racks accepted; {count('kept')} of "
         f"{count('n_tubes_true')} tubes kept, {count('n_tubes_true', accepted)} of them in accepted racks; "
-        f"{count('ambiguous')} racks ambiguous, {count('needless')} of them though the scene is not."
+        f"{count('ambiguous')} racks ambiguous, {count('needless')} of them though the scene is not; of "
+        f"{count('scale_marks')} the cloud's scale is marked as off or unknown."
     )
 
 

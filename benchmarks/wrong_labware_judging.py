@@ -107,6 +107,7 @@ class Verdict:
         false_empty: Slots that are called empty and hold a tube.
         false_occupied: Slots that are called occupied and hold none.
         marked: Accepted racks that are off at their face and say so: their scale is marked.
+        scale_marks: Accepted racks with such a mark, off or not.
     """
 
     racks: int = 0
@@ -126,6 +127,7 @@ class Verdict:
     false_empty: int = 0
     false_occupied: int = 0
     marked: int = 0
+    scale_marks: int = 0
 
     @property
     def wrong(self) -> int:
@@ -157,16 +159,17 @@ def judge(truth: Truth, answer: Answer, same_rack: bool, face_truth: Truth | Non
     for turn in turns:
         off = not same_rack or face_is_off(_turned(face_truth or truth, turn), answer)
         verdict = _judged(_turned(truth, turn), answer, off)
-        if off and same_rack and SCALE in answer.marks:
+        if off and same_rack and answer.marks & SCALE_MARKS:
             verdict = replace(verdict, wrong_racks=0, marked=1)
         verdicts.append(verdict)
     best = min(verdicts, key=lambda verdict: (verdict.wrong, -verdict.kept))
     needless = int(answer.ambiguous and same_rack and len(turns) == 1)
-    return best + Verdict(racks=1, ambiguous=int(answer.ambiguous), needless=needless)
+    marks = int(bool(answer.marks & SCALE_MARKS))
+    return best + Verdict(racks=1, ambiguous=int(answer.ambiguous), needless=needless, scale_marks=marks)
 
 
-SCALE = "scale"
-"""The mark that says that an accepted rack is off along the line of sight."""
+SCALE_MARKS = frozenset(("scale", "scale_unknown"))
+"""Marks that say that an accepted rack is off along the line of sight, or that nobody can tell."""
 _NO_TURN: FloatArray = np.eye(4)
 
 

@@ -112,7 +112,7 @@ def _report(
     """Evaluate, write and print."""
     from tubepose.confusion import confusion
     from tubepose.evaluation import compare, evaluate, seed_spread, slot_accuracy, summarise
-    from tubepose.pipeline import STOCHASTIC
+    from tubepose.methods import METHODS, foremost
     from tubepose.records import ESTIMATE_COLUMNS, RACK_COLUMNS, SLOT_COLUMNS, TIMING_COLUMNS, to_table
     from tubepose.report.tables import accuracy_table, timing_table
     from tubepose.report.writing import write_csv, write_table
@@ -121,15 +121,15 @@ def _report(
 
     estimates = to_table(tables.estimates, ESTIMATE_COLUMNS)
     tube_models = {name: tube for session in measured.sessions for name, tube in session.types.items()}
+    seeds_of_methods = {name: range(seeds) for name, method in METHODS.items() if method.is_stochastic}
     errors = evaluate(
         estimates, measured.truth, tube_models, methods,
-        racks=to_table(tables.racks, RACK_COLUMNS), seeds={method: range(seeds) for method in STOCHASTIC},
+        racks=to_table(tables.racks, RACK_COLUMNS), seeds=seeds_of_methods,
     )  # fmt: skip
     summary = summarise(errors, methods)
     write_csv(out / "errors.csv", errors)
     write_csv(out / "summary.csv", summary)
-    reference = next((name for name in ("profile", "paper") if name in methods), methods[0])
-    write_csv(out / "comparison.csv", compare(errors, reference))
+    write_csv(out / "comparison.csv", compare(errors, foremost(methods)))
     write_csv(out / "uncertainty.csv", uncertainty(errors))
     write_csv(out / "coverage.csv", coverage(errors))
     write_csv(out / "confusion.csv", confusion(errors))
@@ -138,8 +138,8 @@ def _report(
     write_csv(out / "slot_accuracy.csv", slots)
     notes = [_data_note(measured, jobs), *measured.notes, *_rack_notes(tables), *_slot_notes(slots)]
     notes += [*_uncertainty_notes(errors, measured), *_confusion_notes(errors)]
-    notes += _rival_notes(methods, config, seeds)
-    if any(method in STOCHASTIC for method in methods):
+    notes += [note for name in methods if (note := METHODS[name].note(config, seeds))]
+    if any(METHODS[name].is_stochastic for name in methods):
         notes += _spread_notes(seed_spread(errors))
     accuracy = accuracy_table(summary, notes, published)
     timing = timing_table(to_table(tables.timings, TIMING_COLUMNS), [_machine_note()], published)
@@ -199,24 +199,6 @@ def _uncertainty_notes(errors: pd.DataFrame, measured: MeasuredTruth) -> list[st
         f"{row['method']}: {row['inside_95']:.1%} of {row['n']} truths inside the stated 95 % region{own}; "
         f"mean tilt error {row['tilt_deg_all']:.2f} deg of all, {row['tilt_deg_best_half']:.2f} of the better half."
         for row in rows
-    ]
-
-
-def _rival_notes(methods: Sequence[str], config: Config, seeds: int) -> list[str]:
-    from tubepose.rivals import PACKAGES, settings_note
-
-    notes = _global_icp_notes(config, seeds) if "global-icp" in methods else []
-    return notes + [settings_note(method, config, seeds) for method in methods if method in PACKAGES]
-
-
-def _global_icp_notes(config: Config, seeds: int) -> list[str]:
-    icp = config.icp
-    rounds = ", ".join(f"{distance * 1e3:g}" for distance in icp.max_distance_m)
-    return [
-        f"global-icp: Open3D FPFH (radius {icp.feature_radius_m * 1e3:g} mm, normals {icp.normal_radius_m * 1e3:g} mm, "
-        f"voxel {icp.voxel_m * 1e3:g} mm) + RANSAC "
-        f"({icp.ransac_iterations} iterations, {icp.ransac_distance_m * 1e3:g} mm), "
-        f"{seeds} seeds; then ICP {icp.estimation}, distances {rounds} mm, as slot-icp. No rejection in either.",
     ]
 
 

@@ -46,8 +46,7 @@ def read_tubes(names: str) -> tuple[TubeModel, ...]:
 def read_methods(names: str) -> tuple[str, ...]:
     """Methods of a comma-separated list."""
     from tubepose.errors import ConfigError
-    from tubepose.pipeline import METHODS
-    from tubepose.rivals import require_packages
+    from tubepose.methods import METHODS, require_methods
 
     methods = tuple(dict.fromkeys(name.strip() for name in names.split(",") if name.strip()))
     unknown = [name for name in methods if name not in METHODS]
@@ -55,7 +54,7 @@ def read_methods(names: str) -> tuple[str, ...]:
         raise ConfigError(unknown_name("method", unknown[0], METHODS))
     if not methods:
         raise ConfigError(f"no method is named; expected one or more of {', '.join(METHODS)}")
-    require_packages(methods)
+    require_methods(methods)
     return methods
 
 

@@ -10,9 +10,9 @@ if TYPE_CHECKING:
     from tubepose.batch import DetectorFactory, Job, UnnamedJob
     from tubepose.config import Config
     from tubepose.labware import Labware
-    from tubepose.pipeline import Scene, TubeEstimate
     from tubepose.records import Row
     from tubepose.result_tables import Tables
+    from tubepose.scene import Scene, TubeEstimate
 
 
 JUDGED_FILES = (

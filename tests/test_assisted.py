@@ -10,11 +10,11 @@ from test_pipeline import CONFIG, PLACED, RACK, T_CAMERA_RACK, TUBES, frame_of, 
 
 from tubepose import pipeline
 from tubepose.capture.frame import RgbdFrame
-from tubepose.detection import Detection, points_in_box, rows_in_box
+from tubepose.detection import Detection, Detector, best_rack, points_in_box, rows_in_box
 from tubepose.detection.assisted import AssistedDetector
 from tubepose.detection.geometric import GeometricDetector
 from tubepose.detection.model import CAPPED_CLASS, OPEN_CLASS
-from tubepose.pipeline import best_rack, prepare_scene
+from tubepose.pipeline import prepare_scene
 from tubepose.rack import RackPose, RackStatus
 from tubepose.records import rack_row
 from tubepose.slots import identify_tube
@@ -25,7 +25,7 @@ CORNER = (0.0, 0.0, 20.0, 20.0)
 
 
 @dataclass
-class Network:
+class Network(Detector):
     """A network that says what it is told to, and counts how often it is asked."""
 
     found: tuple[Detection, ...]
@@ -150,6 +150,22 @@ def test_a_sure_box_that_holds_hardly_anything_of_its_tube_gets_the_tubes_points
     (found, *_) = assisted(sliver).checked(frame, T_CAMERA_RACK, (sliver,))
     assert 0 < len(rows_in_box(frame, sliver)) < 0.3 * len(tube.point_rows)
     assert np.array_equal(found.point_rows, tube.point_rows)
+
+
+def test_a_second_opinion_is_asked_for_once(frame):
+    detector = assisted(rack_box(0.9, CORNER))
+    found = detector.detect(frame)
+    others = detector.second_opinion(frame, found, "no rack there")
+    assert {box.source for box in others} == {"geometric"}
+    assert {box.note for box in others} == {"no rack in the network's box (no rack there)"}
+    assert detector.second_opinion(frame, others, "still none") == ()
+
+
+def test_a_detector_with_one_source_of_boxes_offers_nothing_else(frame):
+    found = (rack_box(0.9),)
+    for detector in (Network(found), GeometricDetector(RACK, TUBES, CONFIG)):
+        assert detector.second_opinion(frame, found, "no rack there") == ()
+        assert detector.checked(frame, T_CAMERA_RACK, found) is found
 
 
 def test_where_the_cloud_does_not_help_either_the_first_answer_stays(frame):

@@ -20,7 +20,7 @@ from commands import Ended, tubepose
 from conftest import SMALL_RACK, SMALL_TUBES
 from onnx import TensorProto, helper, numpy_helper
 
-from tubepose import batch
+from tubepose.batch import running
 from tubepose.capture.mcap_writing import write_mcap
 from tubepose.capture.source import open_captures
 from tubepose.checks import SENTENCES
@@ -408,7 +408,7 @@ def test_fail_fast_ends_with_the_first_bad_capture(damaged: Path, tmp_path: Path
 def test_ctrl_c_is_one_line_and_what_was_done_is_written(
     after: int, words: str, small_session: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    prepare, asked = batch.prepare_scene, []
+    prepare, asked = running.prepare_scene, []
 
     def stopped(*args: Any) -> Any:
         if len(asked) == after:
@@ -416,7 +416,7 @@ def test_ctrl_c_is_one_line_and_what_was_done_is_written(
         asked.append(args[0].capture)
         return prepare(*args)
 
-    monkeypatch.setattr(batch, "prepare_scene", stopped)
+    monkeypatch.setattr(running, "prepare_scene", stopped)
     (tmp_path / "out").mkdir()
     (tmp_path / "out" / "errors.csv").write_text("of an earlier bench")
     ended = tubepose("estimate", small_session, "--no-overlays", "--out", tmp_path / "out")

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from tubepose.detection import Detection
 from tubepose.detection.evaluation import evaluate_detector, kinds_of
 from tubepose.detection.labelled_images import find_labelled, labelled_set
-from tubepose.detection.metrics import ComparedBoxes, average_precision, match, overlaps, score
+from tubepose.detection.metrics import ComparedBoxes, average_precision, box_accuracy, match, overlaps
 from tubepose.errors import DetectorError
 
 NONE = np.empty((0, 4))
@@ -41,7 +41,7 @@ def test_each_detection_takes_the_free_truth_that_it_overlaps_most():
 
 def test_a_box_on_something_that_does_not_count_is_neither_right_nor_wrong():
     one = image(boxes([0, 0, 10, 10]), boxes([0, 0, 10, 10], [50, 50, 60, 60]), [0.9, 0.8], boxes([45, 45, 70, 70]))
-    found = score([one], 0.5)
+    found = box_accuracy([one], 0.5)
     assert (found.n_detected, found.precision, found.recall, found.ap50) == (1, 1.0, 1.0, pytest.approx(1.0))
 
 
@@ -55,7 +55,7 @@ def test_average_precision_of_a_known_ranking():
 
 def test_loose_boxes_count_at_half_an_overlap_and_not_at_more():
     truth = boxes([0, 0, 100, 100])
-    found = score([image(truth, boxes([0, 0, 100, 72]), [0.9])], 0.5)  # overlap 0.72: five of ten thresholds
+    found = box_accuracy([image(truth, boxes([0, 0, 100, 72]), [0.9])], 0.5)  # overlap 0.72: five of ten thresholds
     assert found.ap50 == pytest.approx(1.0)
     assert found.ap50_95 == pytest.approx(0.5)
 

@@ -23,5 +23,5 @@ def test_the_example_finds_the_tubes_of_a_capture(
     out = capsys.readouterr().out
     assert "chen2023-tube-1-004-original ok" in out
     assert len(re.findall(r"^[A-E]\d+ \[\[", out, re.MULTILINE)) == 18
-    last = names["estimates"][-1].T_camera_tube  # type: ignore[index]
+    last = names["result"].estimates[-1].T_camera_tube  # type: ignore[index]
     assert np.linalg.det(last[:3, :3]) == pytest.approx(1.0)

@@ -161,8 +161,7 @@ def estimate_row(
     return {
         "session": "s", "trial": trial, "capture": f"{trial}-original", "frame": frame,
         "timestamp_ns": 1_700_000_000_000_000_001, "method": method, "seed": seed, "slot": slot, "tube": tube,
-        "status": status, "reason": "", "confidence": confidence, **at, "tilt_deg": 0.0, "inlier_rmse_m": 0.0,
-        "fitness": 1.0, "n_points": 100,
+        "status": status, "reason": "", "confidence": confidence, **at, "tilt_deg": 0.0, "n_points": 100,
     }  # fmt: skip
 
 

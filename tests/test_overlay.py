@@ -9,10 +9,11 @@ import scenes
 
 from tubepose.capture.frame import RgbdFrame
 from tubepose.config import Config
-from tubepose.detection import Detection
+from tubepose.detection import Detection, Detector
 from tubepose.labware import load_rack, load_tube
-from tubepose.pipeline import Scene, TubeEstimate, estimate_tubes, prepare_scene
+from tubepose.pipeline import estimate_tubes, prepare_scene
 from tubepose.report.overlay import COLORS_BGR, STATE_COLORS_BGR, WIDTH_PX, Picture, _ImageView, draw_overlay
+from tubepose.scene import Scene, TubeEstimate
 from tubepose.slots import SlotState
 from tubepose.transforms import FloatArray, transform_points
 from tubepose.tube import TubeStatus
@@ -26,7 +27,7 @@ T_RACK_TUBE = scenes.tube_pose(RACK, "B2", 0.02, 0.01)
 
 
 @dataclass(frozen=True)
-class Fixed:
+class Fixed(Detector):
     detections: tuple[Detection, ...]
     name: str = "recorded"
 
@@ -55,7 +56,7 @@ def make_scene(organised: bool = True) -> Scene:
 
 
 def estimates_of(scene: Scene, status: TubeStatus = TubeStatus.OK) -> tuple[TubeEstimate, ...]:
-    estimates, _ = estimate_tubes(scene, "upright", CONFIG)
+    estimates = estimate_tubes(scene, "upright", CONFIG).estimates
     assert len(estimates) == 1
     return tuple(replace(e, pose=replace(e.pose, status=status)) for e in estimates)
 

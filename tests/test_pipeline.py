@@ -12,26 +12,20 @@ import scenes
 from tubepose.capture.hints import SlotHint
 from tubepose.checks import said
 from tubepose.config import Config
-from tubepose.detection import Detection
+from tubepose.detection import Detection, Detector
 from tubepose.detection.geometric import GeometricDetector
 from tubepose.labware import load_rack, load_tube
-from tubepose.pipeline import (
-    DEFAULT_METHOD,
-    METHODS,
-    STOCHASTIC,
-    TUBE_METHODS,
-    allowed_types,
-    estimate_tubes,
-    prepare_scene,
-)
+from tubepose.methods import METHODS
+from tubepose.methods.profile_boxes import allowed_types
+from tubepose.pipeline import estimate_tubes, prepare_scene
 from tubepose.rack import RackStatus
-from tubepose.records import slot_rows
-from tubepose.rivals import PACKAGES
+from tubepose.records import FIT_COLUMNS, estimate_row, slot_rows
 from tubepose.simulation.camera import default_camera
 from tubepose.transforms import make_transform, tilt_rad, transform_points
 from tubepose.tube import TubeStatus
 
 CONFIG = Config()
+TUBE_METHODS = [name for name, method in METHODS.items() if method.needs_targets]
 RACK = load_rack("chen2023-soft-5x10")
 TUBES = tuple(load_tube(f"chen2023-tube-{i}") for i in (1, 2, 3))
 T_CAMERA_RACK = scenes.camera_from_rack(RACK, 0.3, 0.15)
@@ -43,7 +37,7 @@ PLACED = {
 
 
 @dataclass(frozen=True)
-class Fixed:
+class Fixed(Detector):
     """A detector that says what it is told to."""
 
     detections: tuple[Detection, ...]
@@ -78,13 +72,6 @@ def scene():
     return prepare(frame_of(), hint=hint_for(T_CAMERA_RACK))
 
 
-def test_the_rivals_and_ours_have_their_names():
-    assert set(METHODS) >= {"paper", "upright", "slot-icp", "global-icp", "kiss-matcher", "gicp"}
-    assert tuple(METHODS) == ("profile", *TUBE_METHODS)
-    assert DEFAULT_METHOD == "profile"
-    assert set(METHODS) >= STOCHASTIC == {"global-icp", "kiss-matcher"}
-
-
 def test_slots_and_kinds_of_all_tubes_are_found(scene):
     assert scene.rack_pose.status is RackStatus.OK
     assert scene.rack_pose.resolved_by == "hint"
@@ -93,7 +80,7 @@ def test_slots_and_kinds_of_all_tubes_are_found(scene):
 
 
 def test_the_paper_recovers_the_poses_in_both_frames(scene):
-    estimates, _ = estimate_tubes(scene, "paper", CONFIG)
+    estimates = estimate_tubes(scene, "paper", CONFIG).estimates
     assert len(estimates) == 3
     for estimate in estimates:
         _, T_rack_tube = PLACED[estimate.target.slot]
@@ -106,15 +93,34 @@ def test_the_paper_recovers_the_poses_in_both_frames(scene):
 
 @pytest.mark.parametrize("method", sorted(TUBE_METHODS))
 def test_every_method_answers_for_every_target_once(scene, method):
-    for package in PACKAGES.get(method, ()):
+    for package in METHODS[method].packages:
         pytest.importorskip(package, reason="an extra: pip install '.[rivals]'")
-    seed = 0 if method in STOCHASTIC else None
-    estimates, times = estimate_tubes(scene, method, CONFIG, seed)
+    seed = 0 if METHODS[method].is_stochastic else None
+    result = estimate_tubes(scene, method, CONFIG, seed)
+    estimates, times = result.estimates, result.times
     assert [estimate.target for estimate in estimates] == list(scene.targets)
     assert {(estimate.method, estimate.seed) for estimate in estimates} == {(method, seed)}
     assert [time.instance for time in times] == [target.slot for target in scene.targets]
     assert all((time.stage, time.method, time.seed) == ("tube", method, seed) for time in times)
     assert all(time.duration_ms > 0 for time in times)
+
+
+@pytest.mark.parametrize(
+    ("method", "columns"),
+    [
+        ("paper", {"excess_rms_m", "inside_share"}),
+        ("slot-icp", {"inlier_rmse_m", "fitness"}),
+        ("upright", set()),
+        ("profile", {"top_rms_m", "top_seen_share"}),
+    ],
+)
+def test_each_way_of_fitting_has_columns_of_its_own(scene, seen, method, columns):
+    asked = seen if method == "profile" else scene
+    estimates = [e for e in estimate_tubes(asked, method, CONFIG).estimates if not e.target.tube.is_open]
+    assert estimates
+    for estimate in estimates:
+        row = estimate_row({}, asked, estimate)
+        assert {name for name in FIT_COLUMNS if np.isfinite(row[name])} == columns
 
 
 def test_the_shared_stages_are_timed_in_the_papers_order(scene):
@@ -147,8 +153,8 @@ def test_moving_the_camera_changes_no_pose_in_the_rack(scene):
         transform_points(T_moved_camera, frame.cloud_m), None, scenes.CAMERA, None, "test", organised=False
     )
     found = prepare(moved, hint=hint_for(T_new))
-    before = {e.target.slot: e.pose for e in estimate_tubes(scene, "paper", CONFIG)[0]}
-    after = {e.target.slot: e.pose for e in estimate_tubes(found, "paper", CONFIG)[0]}
+    before = {e.target.slot: e.pose for e in estimate_tubes(scene, "paper", CONFIG).estimates}
+    after = {e.target.slot: e.pose for e in estimate_tubes(found, "paper", CONFIG).estimates}
     assert set(after) == set(before)
     for slot, pose in after.items():
         assert np.rad2deg(tilt_rad(pose.T_rack_tube[:3, 2], before[slot].T_rack_tube[:3, 2])) < 0.15
@@ -166,7 +172,7 @@ def test_boxes_of_a_detector_select_their_points():
     found = prepare(frame, detector=detector, hint=hint_for(T_CAMERA_RACK))
     (target,) = found.targets
     assert (target.detection, target.slot, target.tube) == (1, "C5", TUBES[1])
-    (estimate,), _ = estimate_tubes(found, "paper", CONFIG)
+    (estimate,) = estimate_tubes(found, "paper", CONFIG).estimates
     assert estimate.pose.status is TubeStatus.OK
 
 
@@ -176,7 +182,7 @@ def test_without_a_rack_nothing_is_invented():
     assert found.rack_pose.status is RackStatus.NOT_FOUND
     assert found.rack_pose.reason_code == "no_detection"
     assert found.targets == ()
-    assert estimate_tubes(found, "paper", CONFIG) == ((), ())
+    assert estimate_tubes(found, "paper", CONFIG).estimates == ()
     assert [time.stage for time in found.times] == ["detect", "rack"]
     assert (found.noise.source, found.noise.note) == ("prior", "the rack's pose is not known")
 
@@ -215,7 +221,8 @@ def test_a_target_that_no_method_can_be_asked_is_rejected_with_its_reason():
     found = prepare(scenes.unorganised(points), detector=detector)
     assert found.targets[0].slot is None
     for method in TUBE_METHODS:
-        (estimate,), times = estimate_tubes(found, method, CONFIG, 0)
+        result = estimate_tubes(found, method, CONFIG, 0)
+        (estimate,), times = result.estimates, result.times
         assert estimate.pose.status is TubeStatus.REJECTED
         assert estimate.pose.reason_code == "in_no_slot"
         assert estimate.pose.T_rack_tube is None
@@ -235,7 +242,7 @@ def test_an_unknown_kind_keeps_its_slot_and_says_why():
     (target,) = found.targets
     assert (target.slot, target.tube) == ("C5", None)
     assert target.why.code == "unknown_type"
-    (estimate,), _ = estimate_tubes(found, "paper", CONFIG)
+    (estimate,) = estimate_tubes(found, "paper", CONFIG).estimates
     assert (estimate.pose.status, estimate.pose.reason_code) == (TubeStatus.REJECTED, "unknown_type")
 
 
@@ -271,7 +278,8 @@ def seen():
 def test_profile_needs_neither_boxes_nor_the_slots_of_others(seen):
     assert seen.targets == ()
     assert [time.stage for time in seen.times] == ["detect", "sensor", "slots"]
-    estimates, times = estimate_tubes(seen, "profile", CONFIG)
+    result = estimate_tubes(seen, "profile", CONFIG)
+    estimates, times = result.estimates, result.times
     assert {e.target.slot: e.target.tube for e in estimates} == {slot: tube for slot, (tube, _) in PLACED.items()}
     assert {(e.method, e.seed, e.target.detection, e.target.why) for e in estimates} == {("profile", None, None, None)}
     assert [time.instance for time in times] == [estimate.target.slot for estimate in estimates]
@@ -282,7 +290,7 @@ def test_profile_needs_neither_boxes_nor_the_slots_of_others(seen):
         T_camera_tube = T_CAMERA_RACK @ T_rack_tube
         assert np.rad2deg(tilt_rad(estimate.T_camera_tube[:3, 2], T_camera_tube[:3, 2])) < 0.35
         assert np.allclose(estimate.T_camera_tube, T_CAMERA_RACK @ estimate.pose.T_rack_tube)
-        assert 0 < estimate.target.share <= 1
+        assert 0 < estimate.target.top_support <= 1
         assert len(estimate.target.points_m) == estimate.pose.n_points
 
 
@@ -305,9 +313,9 @@ def test_other_methods_still_have_their_targets_beside_profile():
 
 def test_profile_without_a_rack_or_types_invents_nothing(seen):
     lost = prepare(frame_of(), detector=Fixed(()))
-    assert estimate_tubes(lost, "profile", CONFIG) == ((), ())
+    assert estimate_tubes(lost, "profile", CONFIG).estimates == ()
     bare = prepare_scene(seen.frame, RACK, (), Fixed(()), CONFIG, T_camera_rack=T_CAMERA_RACK, methods=("profile",))
-    estimates, _ = estimate_tubes(bare, "profile", CONFIG)
+    estimates = estimate_tubes(bare, "profile", CONFIG).estimates
     assert {(entry.target.tube, entry.pose.status, entry.T_camera_tube) for entry in estimates} == {
         (None, TubeStatus.REJECTED, None)
     }
@@ -319,7 +327,8 @@ def test_a_tube_across_the_rack_is_no_target_of_profile_but_a_row_with_a_reason(
     found = prepare_scene(
         scenes.unorganised(points), RACK, TUBES, Fixed(()), CONFIG, T_camera_rack=T_CAMERA_RACK, methods=("profile",)
     )
-    (estimate,), (time,) = estimate_tubes(found, "profile", CONFIG)
+    result = estimate_tubes(found, "profile", CONFIG)
+    (estimate,), (time,) = result.estimates, result.times
     assert (estimate.target.slot, estimate.target.tube, estimate.T_camera_tube) == (None, None, None)
     assert estimate.target.why == estimate.pose.checks[0]
     assert estimate.pose.reason_code == "lies_across"
@@ -337,7 +346,7 @@ def test_a_tube_across_the_rack_is_no_target_of_profile_but_a_row_with_a_reason(
 
 
 def test_a_slot_with_two_finds_has_one_row_and_it_is_the_first(seen):
-    estimates, _ = estimate_tubes(seen, "profile", CONFIG)
+    estimates = estimate_tubes(seen, "profile", CONFIG).estimates
     first = estimates[0]
     second = dataclasses.replace(
         first,
@@ -393,7 +402,7 @@ def test_boxes_that_say_no_type_leave_all(seen):
 
 def test_a_wrong_class_costs_its_tube_and_no_other(seen):
     wrong = dataclasses.replace(seen, detections=(top_box("E10", TUBES[1], "purple-cap"),))
-    ok = {e.target.slot for e in estimate_tubes(wrong, "profile", CONFIG)[0] if e.pose.status is TubeStatus.OK}
+    ok = {e.target.slot for e in estimate_tubes(wrong, "profile", CONFIG).estimates if e.pose.status is TubeStatus.OK}
     assert ok == {"A1", "C5"}
 
 
@@ -411,6 +420,6 @@ def test_a_slot_where_a_detector_is_sure_and_nothing_is_found_is_not_empty(tubes
             frame, RACK, tubes, Fixed((Detection("tube-open", score, box, "yolo"),)), CONFIG,
             T_camera_rack=T_CAMERA_RACK, methods=("profile",),
         )  # fmt: skip
-        told = [e for e in estimate_tubes(seen, "profile", CONFIG)[0] if e.target.slot == "C5"]
+        told = [e for e in estimate_tubes(seen, "profile", CONFIG).estimates if e.target.slot == "C5"]
         assert bool(told) == (score == 0.9)
     assert [bool(re.search(words, e.pose.reason)) for e in told] == [True]

@@ -77,8 +77,8 @@ def test_what_is_told_of_a_tube(found):
         assert pose.covariance == pytest.approx(pose.covariance.T)
         R = pose.T_rack_tube[:3, :3]
         assert pytest.approx(np.eye(3)) == R @ R.T
-        assert entry.tube.is_open is bool(np.isnan(pose.inlier_rmse_m))
-        assert 0.4 <= pose.fitness <= 1
+        assert entry.tube.is_open is bool(np.isnan(pose.top_rms_m))
+        assert 0.4 <= pose.top_seen_share <= 1
 
 
 @pytest.mark.parametrize("rack_name", sorted(OTHERS))

@@ -1,13 +1,17 @@
 """Types of closed tops: which one a height and a radius belong to, and when to none of those given."""
 
+from dataclasses import replace
+
 import numpy as np
 import profile_scenes as ps
 import pytest
 import scenes
 
-from tubepose.config import ProfileConfig
+from tubepose.config import Config, ProfileConfig
 from tubepose.labware import TubeModel, load_rack, load_tube
+from tubepose.profile.closed_tops import higher_share
 from tubepose.profile.identity import Radii, measured_radii, name_tops
+from tubepose.profile.measure import measure_tops
 from tubepose.profile.tops import top_level_m, top_radius_m
 from tubepose.tube import TubeStatus
 
@@ -72,7 +76,7 @@ def test_a_height_that_all_tubes_of_a_type_share_is_the_files():
 
 
 def test_odds_by_hand():
-    """A lone top exactly as defined: its density against 1 in 100 mm of height and 12 mm of radius."""
+    """A lone top exactly as defined: its density against 12 mm of radius, and 100 mm of height or the same height."""
     ends, seat = 0.6 / np.sqrt(12), CONFIG.cap_height_m * 1e3
     floor = RACK.floor_tolerance_mm
     each = 0.08**2 + (1e3 * CONFIG.top_radius_m) ** 2
@@ -80,7 +84,7 @@ def test_odds_by_hand():
     heights = [
         share / np.sqrt(2 * np.pi * (spread**2 + floor**2 + seat**2)) for spread, share in ((0.3, 0.9), (1.0, 0.1))
     ]
-    expected = np.log(radius * sum(heights) * 100 * 12)
+    expected = np.log(radius * sum(heights) / (0.98 / 100 + 0.02 * sum(heights)) * 12)
     assert names([(LOW, 0.0, 0.0)], [LOW]).odds[0] == pytest.approx(expected, abs=1e-6)
 
 
@@ -157,3 +161,28 @@ def test_a_cap_of_another_width_is_said_to_be_one(frame):
         assert found[slot].tube is None
         assert "100." in found[slot].pose.reason or "99." in found[slot].pose.reason
         assert "19.4 mm" in found[slot].pose.reason  # what it was compared with
+
+
+@pytest.mark.parametrize("narrower_mm", [1.0, 2.2])
+def test_a_width_is_measured_where_the_top_ends_however_far_its_type_is_off(frame, narrower_mm):
+    cap = WIDE.cap.model_copy(update={"diameter_mm": WIDE.cap.diameter_mm - narrower_mm})
+    wrong = WIDE.model_copy(update={"name": "narrower", "cap": cap})
+    entry = ps.by_slot(ps.fit(frame, VIEW, RACK, [wrong]))["A1"]
+    assert entry.pose.status is TubeStatus.REJECTED
+    measured_mm = float(entry.pose.reason.split(" mm wide")[0].split()[-1])
+    assert measured_mm == pytest.approx(WIDE.cap.diameter_mm, abs=0.6)
+
+
+def test_a_top_is_the_highest_thing_over_its_slot(frame):
+    tubes = [WIDE, NARROW, LOW]
+    found = measure_tops(frame, frame.intrinsics, VIEW, RACK, tubes, Config())
+    assert np.all(higher_share(found, tubes, RACK) < 0.02)
+    lower = replace(found, level_m=found.level_m - 4e-3)
+    assert np.all(higher_share(lower, tubes, RACK) > 0.9)
+
+
+def test_a_height_alone_does_not_tell_a_type():
+    """Another type of a standard length is as high: what was not measured across is not sure."""
+    radii = Radii(np.array([np.nan]), np.array([FIT_M]), 1e-4)
+    found = name_tops(np.array([top_level_m(WIDE, RACK)]), radii, np.array([[True]]), RACK, [WIDE], CONFIG)
+    assert 0 < found.odds[0] < CONFIG.min_type_odds

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 import scenes
 
-from tubepose.checks import failed
-from tubepose.config import Config
+from tubepose.checks import failed, mark_codes
+from tubepose.config import Config, RackConfig
 from tubepose.labware import RackModel, load_rack, load_tube
 from tubepose.rack import RackStatus, register_rack
 from tubepose.rack.alternatives import alternatives, gains, lookalikes
@@ -242,3 +242,37 @@ def test_a_bow_turns_with_the_rack():
     k = int(np.argmin([scenes.angle_deg(pose.T_camera_rack[:3, :3], (T @ turn)[:3, :3]) for turn in turns]))
     expected = BOW if k % 2 == 0 else np.array([BOW[1], BOW[0], -BOW[2]])
     np.testing.assert_allclose(pose.bow_m, expected, atol=0.1e-3)
+
+
+def beside_clear_tubes(rack: RackModel, points: np.ndarray, seed: int = 0) -> np.ndarray:
+    """The points of a face with tubes in half of its slots, whose bent light sinks much of the face beside them."""
+    rng = np.random.default_rng(seed)
+    parts, sunk = [points], np.zeros(len(points), bool)
+    for slot in rack.all_slots[::2]:
+        reach = slot.half_size_m[0]
+        disc = rng.uniform(-reach, reach, (2000, 2))
+        disc = disc[np.hypot(*disc.T) < 0.8 * reach] + slot.center_m
+        parts.append(np.column_stack([disc, np.full(len(disc), rack.height_m + 0.04)]))
+        off = points[:, :2] - slot.center_m
+        sunk |= (np.abs(off[:, 0]) < reach) & (off[:, 1] < -0.8 * reach) & (off[:, 1] > -reach - 8e-3)
+    sunk &= (np.abs(points[:, 2] - rack.height_m) < 2e-3) & (rng.random(len(points)) < 0.6)
+    parts[0] = points - np.where(sunk, 6e-3, 0.0)[:, None] * [0.0, 0.0, 1.0]
+    return np.vstack(parts)
+
+
+def test_light_that_tubes_bend_makes_no_opening_wider():
+    points, T = seen_at(TEN, beside_clear_tubes(TEN, scan(TEN)))
+    size = measure_size(look_at_face(points, T, TEN, 0.4e-3, face_grid(TEN, SPACING_M, 0.03), SPACING_M), TEN)
+    wider_m, std_m = size.wider_openings_m()
+    assert abs(2 * wider_m) < 0.8e-3
+    assert abs(wider_m) < 4 * std_m
+    assert register_rack(points, TEN, CONFIG).status is RackStatus.OK
+
+
+@pytest.mark.parametrize(("calibrated", "marked"), [(0.0005, False), (0.05, True)])
+def test_a_distance_that_nothing_checks_is_marked(calibrated, marked):
+    points, _ = seen_at(FIVE, scan(FIVE))
+    config = CONFIG.model_copy(update={"rack": RackConfig(scale_std=calibrated)})
+    pose = register_rack(points, FIVE, config)
+    assert pose.status is RackStatus.OK
+    assert ("scale_unknown" in mark_codes(pose.checks)) == marked

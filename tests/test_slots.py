@@ -89,7 +89,7 @@ def test_every_tube_gets_its_own_slot_and_the_others_stay_empty():
     assigned = assign_slots(tubes, RACK, CONFIG)
     assert [entry.slot for entry in assigned] == held
     assert [entry.detection for entry in assigned] == [0, 1, 2, 3]
-    assert all(entry.why is None and entry.share > 0.8 for entry in assigned)
+    assert all(entry.why is None and entry.hull_share > 0.8 for entry in assigned)
     assert all(np.all(entry.points_m[:, 2] > RACK.height_m + CONFIG.clearance_m) for entry in assigned)
 
 
@@ -103,7 +103,7 @@ def test_two_tubes_on_one_slot_the_larger_share_keeps_it():
     assert (winner.slot, winner.why) == ("B3", None)
     assert loser.slot is None
     assert (loser.why.code, loser.why.detail) == ("slot_taken", "B3")
-    assert 0.5 < loser.share < winner.share
+    assert 0.5 < loser.hull_share < winner.hull_share
 
 
 def test_the_one_that_must_go_takes_its_next_best_free_slot():
@@ -111,7 +111,7 @@ def test_the_one_that_must_go_takes_its_next_best_free_slot():
     winner, other = assign_slots([centred, between], RACK, CONFIG)
     assert winner.slot == "B3"
     assert (other.slot, other.why) == ("B4", None)
-    assert other.share == pytest.approx(slot_shares(between, RACK)[NAMES.index("B4")])
+    assert other.hull_share == pytest.approx(slot_shares(between, RACK)[NAMES.index("B4")])
 
 
 def test_the_slots_do_not_depend_on_the_order_of_the_tubes():
@@ -126,8 +126,8 @@ def test_a_tube_that_lies_across_the_rack_has_no_slot():
     (entry,) = assign_slots([lying], RACK, CONFIG)
     assert entry.slot is None
     assert entry.why.code == "in_no_slot"
-    assert entry.why.value == pytest.approx(100 * entry.share)
-    assert 0 < entry.share < CONFIG.min_share
+    assert entry.why.value == pytest.approx(100 * entry.hull_share)
+    assert 0 < entry.hull_share < CONFIG.min_share
 
 
 def test_a_box_without_points_above_the_top_says_so():

@@ -9,12 +9,14 @@ from profile_scenes import rendered
 from slot_scenes import CAMERA, Post, looked_at, without_pixels
 
 from tubepose.labware import load_rack, load_tube
+from tubepose.rack.fit import laid_flat
 from tubepose.slots import Finding, SlotState, look_at_slots, state_slot
 from tubepose.transforms import make_transform
 
 RACK = load_rack("round-10ml-3x4")  # openings of 21 mm, 78.5 mm deep, 30 x 25 mm apart
 SQUARE = load_rack("chen2023-soft-5x10")
 WIDE = load_tube("chen2023-tube-2")  # cap of 17.45 mm on openings of 16.5 mm
+SQUARELY = scenes.camera_from_rack(SQUARE, 0.2, 0.05)
 ABOVE = scenes.camera_from_rack(RACK, 0.2, 0.05)
 HIGH = Post(9.0e-3, RACK.height_m + 0.04)
 
@@ -39,7 +41,7 @@ def test_an_empty_rack_that_is_seen_is_empty_in_every_slot():
         assert look.in_image == 1.0
         assert look.passed > 0.85
         assert look.seen_share == pytest.approx(1.0, abs=0.02)
-        assert (look.standing, look.covered, look.patches_stopped) == (0.0, 0.0, 0.0)
+        assert (look.standing, look.covered, look.patches_stopped, look.patches_covered) == (0.0,) * 4
 
 
 @pytest.mark.parametrize("black", [False, True])
@@ -213,3 +215,16 @@ def test_a_ray_cast_rack_has_no_wrong_state():
     assert SlotState.OCCUPIED not in rest
     # Wells are dark in a scanner with a projector: ribs tell.
     assert rest.count(SlotState.EMPTY) >= 0.8 * len(rest)
+
+
+@pytest.mark.parametrize("bow_mm", [-2.5, 2.5])
+def test_an_empty_bowed_rack_is_empty_where_its_bow_is_known(bow_mm):
+    flat, bow_m = looked_at(SQUARE, SQUARELY), np.array([bow_mm, -bow_mm, 0.0]) * 1e-3
+    bent = laid_flat(flat.cloud_m.reshape(-1, 3), SQUARELY, -bow_m, SQUARE).reshape(flat.cloud_m.shape)
+    frame = dataclasses.replace(flat, cloud_m=bent)
+    known = look_at_slots(frame, frame.intrinsics, SQUARELY, SQUARE, (), 1e-4, bow_m)
+    assert {state_slot(look, Finding.NONE).state for look in known} == {SlotState.EMPTY}
+    assert max(look.covered for look in known) == 0.0
+    taken_for_flat = look_at_slots(frame, frame.intrinsics, SQUARELY, SQUARE, (), 1e-4, np.zeros(3))
+    right, wrong = (sum(look.passed for look in looks) for looks in (known, taken_for_flat))
+    assert wrong < right

@@ -9,7 +9,7 @@ from tubepose.evaluation import slot_accuracy
 from tubepose.slots import Finding, SlotLook, SlotState, state_slot
 from tubepose.slots.state import ACCEPTED, PRIOR_DOUBTFUL
 
-NOTHING = SlotLook("A1", *[0.0] * 11)
+NOTHING = SlotLook("A1", *[0.0] * 12)
 
 
 def seen(passed=0.0, stopped=0.0, covered=0.6):
@@ -88,3 +88,11 @@ def test_not_seen_is_counted_apart_from_right_and_wrong():
             "n_not_seen": 1, "n_unclear": 1,
         }
     ]  # fmt: skip
+
+
+def test_what_the_cap_of_a_neighbour_covers_says_nothing_of_a_slot():
+    look = dataclasses.replace(NOTHING, patches_passed=16.0, patches_covered=5.0, covered=0.3, seen_share=0.3)
+    assert state_slot(look, Finding.NONE).state is SlotState.UNCLEAR
+    assert state_slot(look.explained(0.28), Finding.NONE).state is SlotState.EMPTY
+    assert dataclasses.asdict(look.explained(0.0)) == dataclasses.asdict(look)
+    assert look.explained(1.0).patches_covered == 0.0

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
-from tubepose.evaluation import _covariances
+from tubepose.evaluation.matching import _covariances
 from tubepose.pose_errors import COVARIANCE_AXES, COVARIANCE_COLUMNS, squared_mahalanobis
 from tubepose.records import covariance_columns
 from tubepose.transforms import FloatArray, make_transform

@@ -93,6 +93,10 @@ SENTENCES = {
         "everything is {detail} than {name} by {value:.2f}%, at most {limit:g}% expected: the cloud's scale "
         "(depth_scale_m, calibration) or the rack's file is off"
     ),
+    "scale_unknown": (
+        "its distance hangs on the cloud's scale, which is known to {value:.1f} mm there (three standard deviations, "
+        "by what is seen of {name} and rack.scale_std), {limit:g} mm expected: state the calibration of your sensor"
+    ),
     "floor": (
         "the floor of the slots is seen {value:.1f} mm {detail} than {name} says, at most {limit:.1f} mm expected: "
         "another rack, or correct floor_mm"
@@ -146,6 +150,10 @@ SENTENCES = {
     "height_off": (
         "the top is {value:+.1f} mm off the height of {name} in {detail}, at most {limit:.1f} mm expected: another "
         "type, or it stands on something"
+    ),
+    "something_higher": (
+        "{value:.0f}% of the points over its top lie above it, at most {limit:.0f}% expected: something taller stands "
+        "there"
     ),
     "not_in_slot": "stands or leans as slot {detail} does not let it: jammed, on something, or not in the slot",
     "tilt_uncertain": (

@@ -71,7 +71,7 @@ def compare_sizes(scene: Scene, estimates: Sequence[TubeEstimate], config: Confi
 
     Args:
         scene: The frame and its rack's pose.
-        estimates: Answers of `profile`, whose tubes' tops are measured.
+        estimates: Answers of one method; only measured tops say something of the tubes.
         config: Sections rack and profile are used.
 
     Returns:

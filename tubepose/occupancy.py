@@ -4,9 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+import numpy as np
+from numpy.typing import NDArray
+
 from tubepose.scene import Scene, TubeEstimate
-from tubepose.slots import Finding, StatedSlot, covered_slots, state_slot
+from tubepose.slots import Finding, StatedSlot, covered_slots, slot_cores_m, state_slot
+from tubepose.transforms import FloatArray, transform_points
 from tubepose.tube import TubeStatus
+
+DISC_MARGIN_M = 1.0e-3
+"""A top reaches over what lies this near beside it, metres: the cells that cover is counted in."""
 
 
 def held_slots(scene: Scene, estimates: Sequence[TubeEstimate]) -> dict[str, TubeEstimate]:
@@ -36,8 +43,37 @@ def stated_slots(scene: Scene, estimates: Sequence[TubeEstimate]) -> dict[str, S
     if scene.rack_pose.T_camera_rack is None:
         return {}
     held = held_slots(scene, estimates)
-    looks = {look.slot: look for look in scene.looks}
+    over = reached_over(scene, estimates)
+    looks = {look.slot: look.explained(over[look.slot]) for look in scene.looks}
     return {slot.name: state_slot(looks.get(slot.name), _finding(held.get(slot.name))) for slot in scene.rack.all_slots}
+
+
+def reached_over(scene: Scene, estimates: Sequence[TubeEstimate]) -> dict[str, float]:
+    """Share of every slot's middle that the tops of accepted tubes of other slots reach over, by the slot's name.
+
+    Args:
+        scene: The scene.
+        estimates: Answers of one method.
+    """
+    accepted = [e for e in estimates if e.pose.status is TubeStatus.OK and e.target.tube and e.target.slot is not None]
+    poses = [(e, e.target.tube, e.pose.T_rack_tube) for e in accepted]
+    discs = [
+        (e.target.slot, transform_points(T, np.array([0.0, 0.0, tube.height_m]))[:2], tube.max_radius_m)
+        for e, tube, T in poses
+        if tube is not None and T is not None
+    ]
+    return {
+        name: 1.0 - float(np.mean(_clear(core_m, [disc[1:] for disc in discs if disc[0] != name])))
+        for name, core_m in slot_cores_m(scene.rack, scene.tubes).items()
+    }
+
+
+def _clear(places_m: FloatArray, discs: Sequence[tuple[FloatArray, float]]) -> NDArray[np.bool_]:
+    """Which places (N, 2), rack frame, no disc lies over, shape (N,)."""
+    clear = np.ones(len(places_m), bool)
+    for center_m, radius_m in discs:
+        clear &= np.hypot(*(places_m - center_m).T) > radius_m + DISC_MARGIN_M
+    return clear
 
 
 def _finding(estimate: TubeEstimate | None) -> Finding:

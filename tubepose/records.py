@@ -12,11 +12,13 @@ from scipy.spatial.transform import Rotation
 
 from tubepose.capture.frame import RgbdFrame
 from tubepose.checks import Check, mark_codes
+from tubepose.detection import best_rack
 from tubepose.occupancy import held_slots, stated_slots
-from tubepose.pipeline import Scene, StageTime, TubeEstimate, best_rack
 from tubepose.pose_errors import COVARIANCE_COLUMNS, upper_half
 from tubepose.rack import RackPose
+from tubepose.scene import Scene, TubeEstimate
 from tubepose.sensor import SensorNoise
+from tubepose.stage_times import StageTime
 from tubepose.transforms import FloatArray, quaternion_wxyz, tilt_rad
 
 Row = dict[str, Any]
@@ -54,17 +56,20 @@ SLOT_COLUMNS = (
     "p_occupied",
     "seen_share",
     "tube",
-    "share",
+    "hull_share",
+    "top_support",
     "n_points",
     "status",
     "reason",
     "reason_code",
     "rack_marks",
 )
+FIT_COLUMNS = ("inlier_rmse_m", "fitness", "excess_rms_m", "inside_share", "top_rms_m", "top_seen_share")
+"""How well points agree with an answer: a pair for ICP, a pair for `paper`, a pair for `profile`."""
 ESTIMATE_COLUMNS = (
     "session", "trial", "capture", "frame", "timestamp_ns", "method", "seed", "slot", "tube", "ambiguous", "status",
     "reason", "reason_code", "rack_marks", "confidence",
-    *POSE_COLUMNS, "tilt_deg", "inlier_rmse_m", "fitness", "n_points", *COVARIANCE_COLUMNS,
+    *POSE_COLUMNS, "tilt_deg", "n_points", *FIT_COLUMNS, *COVARIANCE_COLUMNS,
 )  # fmt: skip
 TIMING_COLUMNS = (
     "session",
@@ -197,7 +202,8 @@ def slot_rows(keys: Row, method: str, scene: Scene, estimates: Sequence[TubeEsti
             target = estimate.target
             row |= {
                 "tube": target.tube.name if target.tube is not None else None,
-                "share": target.share,
+                "hull_share": target.hull_share,
+                "top_support": target.top_support,
                 "n_points": len(target.points_m),
                 "status": estimate.pose.status.value,
                 "reason": estimate.pose.reason,
@@ -228,9 +234,8 @@ def estimate_row(keys: Row, scene: Scene, estimate: TubeEstimate) -> Row:
         "confidence": pose.confidence,
         **pose_columns(estimate.T_camera_tube),
         "tilt_deg": tilt_deg,
-        "inlier_rmse_m": pose.inlier_rmse_m,
-        "fitness": pose.fitness,
         "n_points": pose.n_points,
+        **{name: getattr(pose, name) for name in FIT_COLUMNS},
         **covariance_columns(pose.covariance),
     }
 

@@ -24,17 +24,20 @@ class TubeTarget:
         detection: Index of the detection; None for a tube that `profile` found itself.
         slot: Name of the slot, or None.
         tube: The tube's model, or None where its type is unknown.
-        share: Share of its projected hull in the slot's opening; of `profile`, how much of its top was seen.
+        hull_share: Share of its projected hull in the slot's opening; NaN for a tube that `profile` found itself.
         why: Why no method can be asked; None where one can.
         points_m: Points, rack frame, shape (N, 3), metres.
+        top_support: Share of its top that was seen, less the share of its surroundings; NaN for a detected tube, and
+            where there is no top.
     """
 
     detection: int | None
     slot: str | None
     tube: TubeModel | None
-    share: float
+    hull_share: float
     why: Check | None
     points_m: FloatArray
+    top_support: float = float("nan")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -49,7 +52,7 @@ class Scene:
         detections: All boxes.
         rack_pose: The rack's pose, or why there is none.
         noise: The sensor's noise, measured in this frame; the prior without the rack's pose.
-        targets: Every detected tube (empty without a rack's pose).
+        targets: Every detected tube (empty without a rack's pose, and where no method needs them).
         times: Duration of the shared stages.
         looks: What was seen of every slot, in the order of the rack's slots (empty without a rack's pose).
     """
@@ -61,8 +64,8 @@ class Scene:
     detections: tuple[Detection, ...]
     rack_pose: RackPose
     noise: SensorNoise
-    targets: tuple[TubeTarget, ...]
-    times: tuple[StageTime, ...]
+    targets: tuple[TubeTarget, ...] = ()
+    times: tuple[StageTime, ...] = ()
     looks: tuple[SlotLook, ...] = ()
 
 
@@ -71,7 +74,7 @@ class TubeEstimate:
     """One method's answer for one detected tube.
 
     Attributes:
-        method: Name in `METHODS`.
+        method: Name in `tubepose.methods.METHODS`.
         seed: Seed of a stochastic method, else None.
         target: What the method was asked.
         pose: Its answer in the rack frame.

@@ -12,7 +12,7 @@ from tubepose.capture.frame import RgbdFrame
 from tubepose.detection.boxes import edges_from_box
 from tubepose.detection.geometric import GeometricDetector
 from tubepose.detection.metrics import overlaps
-from tubepose.detection.model import CAPPED_CLASS, Detection, rows_in_box
+from tubepose.detection.model import CAPPED_CLASS, Detection, Detector, rows_in_box
 from tubepose.detection.yolo import YoloDetector
 from tubepose.transforms import FloatArray
 
@@ -25,7 +25,7 @@ LEAST_COMMON = 0.3
 
 
 @dataclass(frozen=True, slots=True)
-class AssistedDetector:
+class AssistedDetector(Detector):
     """A network with the geometric detector at its side.
 
     Attributes:
@@ -51,8 +51,10 @@ class AssistedDetector:
         # A cloud without a rack is a rack of score 0: then the network's doubtful box is the better one.
         return helped if best is None or _rack_score(helped) > 0 else found
 
-    def second_opinion(self, frame: RgbdFrame, reason: str) -> tuple[Detection, ...]:
-        """Boxes of the cloud, for a frame in which the network's rack could not be registered."""
+    def second_opinion(self, frame: RgbdFrame, found: tuple[Detection, ...], reason: str) -> tuple[Detection, ...]:
+        """Boxes of the cloud, where the network's rack could not be registered and the cloud was not asked yet."""
+        if any(box.is_rack and box.source == self.geometric.name for box in found):
+            return ()
         return self._from_cloud(frame, f"no rack in the network's box ({reason})")
 
     def checked(

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from tubepose.detection.boxes import edges_from_box
 from tubepose.detection.labelled_images import LabelledFiles
-from tubepose.detection.metrics import OVERLAPS, ComparedBoxes, Scores, match, score
+from tubepose.detection.metrics import OVERLAPS, BoxAccuracy, ComparedBoxes, box_accuracy, match
 from tubepose.detection.model import Detection
 from tubepose.errors import DetectorError
 from tubepose.transforms import FloatArray
@@ -69,7 +69,7 @@ class DetectionReport:
     """What `evaluate_detector` finds.
 
     Attributes:
-        summary: One row per class and one each for `ALL_TUBES` and `ALL_RACKS`: class and `metrics.Scores`.
+        summary: One row per class and one each for `ALL_TUBES` and `ALL_RACKS`: class and `metrics.BoxAccuracy`.
         n_frames: Pictures with at least one tube.
         n_success: Those of them in which every labelled tube and rack is found with the right class.
         judged: Every picture, in order.
@@ -136,7 +136,7 @@ def evaluate_detector(
         if kind != "ignore":
             rows.append({"class": name, **asdict(_class_scores(judged, name, kind, kinds, least_score, words))})
     for word, kind in ((ALL_TUBES, "tube"), (ALL_RACKS, "rack")):
-        rows.append({"class": word, **asdict(score([one.of_kind(kind, kinds) for one in judged], least_score))})
+        rows.append({"class": word, **asdict(box_accuracy([one.of_kind(kind, kinds) for one in judged], least_score))})
     with_tubes = [one for one in judged if any(kinds[name] == "tube" for name in one.truth_names)]
     success = sum(_all_right(one, kinds, words, least_score) for one in with_tubes)
     errors = np.array([_errors(one, kinds, least_score) for one in judged], np.intp)
@@ -150,13 +150,13 @@ def is_kind(found: Detection, kind: str) -> bool:
 
 def _class_scores(
     judged: Sequence[Judged], name: str, kind: str, kinds: Mapping[str, str], least_score: float, words: Collection[str]
-) -> Scores:
+) -> BoxAccuracy:
     """Figures of one class of the labels; where the detector has no such class, only what it finds of it."""
     if name in words:
         pictures = [
             one.compared(lambda known: known == name, lambda found: found.class_name == name, kinds) for one in judged
         ]
-        return score(pictures, least_score)
+        return box_accuracy(pictures, least_score)
     n_truth = n_found = 0
     for one in judged:
         boxes = one.of_kind(kind, kinds, least_score)
@@ -165,7 +165,7 @@ def _class_scores(
         n_truth += int(own.sum())
         n_found += int(own[rows[rows >= 0]].sum())
     nan = float("nan")
-    return Scores(n_truth, 0, nan, n_found / n_truth if n_truth else nan, nan, nan)
+    return BoxAccuracy(n_truth, 0, nan, n_found / n_truth if n_truth else nan, nan, nan)
 
 
 def _all_right(one: Judged, kinds: Mapping[str, str], words: Collection[str], least_score: float) -> bool:

@@ -11,23 +11,25 @@ from scipy.spatial import cKDTree
 
 from tubepose.capture.frame import RgbdFrame
 from tubepose.config import Config
-from tubepose.detection.model import TUBE_CLASS, Detection
+from tubepose.detection.model import TUBE_CLASS, Detection, Detector
 from tubepose.labware import RackModel, TubeModel
 from tubepose.labware.tubes import RACK_CLASS
-from tubepose.preprocessing import TALLEST_TUBE_M, find_rack_top
+from tubepose.preprocessing import TALLEST_TUBE_M
 from tubepose.rack.edges import best_registration, coarse_sample
 from tubepose.rack.fit import top_frame
 from tubepose.rack.pose import MIN_POINTS
 from tubepose.rack.search import levels
+from tubepose.rack_band import find_rack_top
 from tubepose.transforms import FloatArray, invert_transform, transform_points
 
 CELL_M = 5e-4
-# What stands on a rack may lean over its outline.
-MARGIN_M = 5e-3
+# What stands on a rack may lean over its outline. What lies around it tells where it ends: a line of slots farther, and
+# the table.
+MARGIN_M, AROUND_M = 5e-3, 40e-3
 
 
 @dataclass(frozen=True)
-class GeometricDetector:
+class GeometricDetector(Detector):
     """Detector that knows the rack's definition and sees only the cloud.
 
     Attributes:
@@ -55,7 +57,8 @@ class GeometricDetector:
         local = transform_points(invert_transform(T_camera_top), points)
         on_rack = self._on_rack(local)
         band = on_rack & (np.abs(local[:, 2]) < self.config.rack_top.band_m)
-        rack = self._detection(frame, RACK_CLASS, 1.0, rows[on_rack], rows[band])
+        around = self._around_rack(local) if self.config.rack.method == "edges" else on_rack
+        rack = self._detection(frame, RACK_CLASS, 1.0, rows[around], rows[band])
         return (rack, *self._standing(frame, rows[on_rack], local[on_rack]))
 
     def tubes_on(self, frame: RgbdFrame, T_camera_rack: FloatArray) -> tuple[Detection, ...]:
@@ -74,6 +77,12 @@ class GeometricDetector:
         """Which points (N, 3), frame of the top, are of the rack or of what stands on it."""
         near = np.all(np.abs(local_m[:, :2]) < self.rack.outline_m / 2 + MARGIN_M, axis=1)
         return np.asarray(near & (local_m[:, 2] > -self.rack.height_m) & (local_m[:, 2] < TALLEST_TUBE_M))
+
+    def _around_rack(self, local_m: FloatArray) -> NDArray[np.bool_]:
+        """Which points (N, 3), frame of the top, a registration is judged by: those of the rack and beside it."""
+        beyond_m = (np.abs(local_m[:, :2]) - self.rack.outline_m / 2).max(axis=1)
+        above_base = local_m[:, 2] > -self.rack.height_m
+        return np.asarray((beyond_m < AROUND_M) & (above_base | (beyond_m > 0)) & (local_m[:, 2] < TALLEST_TUBE_M))
 
     def _standing(self, frame: RgbdFrame, rows: NDArray[np.intp], local_m: FloatArray) -> tuple[Detection, ...]:
         """Tubes among points of the rack: their rows of the frame (N,), and themselves (N, 3), frame of the top."""

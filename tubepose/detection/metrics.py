@@ -38,7 +38,7 @@ class ComparedBoxes:
 
 
 @dataclass(frozen=True, slots=True)
-class Scores:
+class BoxAccuracy:
     """Figures of one kind of box over all pictures; NaN where there is nothing to divide by.
 
     Attributes:
@@ -107,7 +107,7 @@ def _in_ignored(boxes: ComparedBoxes) -> NDArray[np.bool_]:
     return np.asarray(shared > 0.5 * _area(boxes.found))
 
 
-def score(images: Sequence[ComparedBoxes], least_score: float) -> Scores:
+def box_accuracy(images: Sequence[ComparedBoxes], least_score: float) -> BoxAccuracy:
     """Figures of one kind of box over pictures.
 
     Args:
@@ -126,7 +126,7 @@ def score(images: Sequence[ComparedBoxes], least_score: float) -> Scores:
     counted = ~np.concatenate([ignored for _, ignored in matched[0]]) if images else np.empty(0, bool)
     kept = counted & (scores >= least_score)
     hits, n_detected = int((right & kept).sum()), int(kept.sum())
-    return Scores(
+    return BoxAccuracy(
         n_truth,
         n_detected,
         hits / n_detected if n_detected else float("nan"),

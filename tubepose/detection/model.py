@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -51,7 +52,7 @@ class Detection:
 
 
 class Detector(Protocol):
-    """A source of boxes."""
+    """A source of boxes; what it can do beside finding them is empty unless its class says otherwise."""
 
     @property
     def name(self) -> str:
@@ -65,6 +66,42 @@ class Detector(Protocol):
             DetectorError: The detector cannot work on this frame at all (a network without an image, say).
         """
         ...
+
+    def second_opinion(
+        self,
+        frame: RgbdFrame,  # noqa: ARG002
+        found: tuple[Detection, ...],  # noqa: ARG002
+        reason: str,  # noqa: ARG002
+    ) -> tuple[Detection, ...]:
+        """Other boxes of a frame whose rack could not be registered; none from a detector with one source of boxes.
+
+        Args:
+            frame: The frame.
+            found: What `detect` said of it.
+            reason: Why its rack has no pose.
+        """
+        return ()
+
+    def checked(
+        self,
+        frame: RgbdFrame,  # noqa: ARG002
+        T_camera_rack: FloatArray,  # noqa: ARG002
+        found: tuple[Detection, ...],
+    ) -> tuple[Detection, ...]:
+        """Boxes of tubes held against a registered rack; as they are from a detector with one source of boxes.
+
+        Args:
+            frame: The frame.
+            T_camera_rack: The rack's pose, shape (4, 4), metres.
+            found: What is known so far.
+        """
+        return found
+
+
+def best_rack(detections: Sequence[Detection]) -> Detection | None:
+    """The rack that is registered: the one of the best score."""
+    racks = [detection for detection in detections if detection.is_rack]
+    return max(racks, key=lambda detection: detection.score, default=None)
 
 
 def rows_in_box(frame: RgbdFrame, detection: Detection, margin: float = 0.0) -> NDArray[np.intp]:

@@ -9,11 +9,11 @@ from tubepose.capture.frame import RgbdFrame
 from tubepose.detection.box_files import ImageBoxes, read_coco, read_yolo_txt
 from tubepose.detection.boxes import box_from_edges, class_words, image_size_px
 from tubepose.detection.label_formats import CLASS_FILES, by_picture_name, find_class_file, read_class_names
-from tubepose.detection.model import Detection
+from tubepose.detection.model import Detection, Detector
 from tubepose.errors import DetectorError
 
 
-class RecordedDetector:
+class RecordedDetector(Detector):
     """Boxes that somebody, or another program, wrote to a file.
 
     For frame 2 of capture ``trial_01/original`` these names are looked for, in this order (for COCO they are compared

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from tubepose.capture.frame import RgbdFrame
 from tubepose.detection.boxes import box_from_edges, class_words
 from tubepose.detection.closer_look import LEAST_TUBE_SCORE, look_twice
-from tubepose.detection.model import Detection
+from tubepose.detection.model import Detection, Detector
 from tubepose.detection.transformers import refuse_queries
 from tubepose.detection.yolo_decoding import (
     LAYOUT_SHAPES,
@@ -30,7 +30,7 @@ from tubepose.errors import DetectorError
 from tubepose.labware.tubes import RACK_CLASS
 
 
-class YoloDetector:
+class YoloDetector(Detector):
     """Boxes from a YOLO model.
 
     The layout of the output is taken from the argument, else from the file's metadata, else from the shape of a real

@@ -28,8 +28,15 @@ DISC_GAP_M = 0.9e-3
 LABEL_CELL_M = 5.0e-4
 NEAR_TOP_M = 2.5e-3
 """Points this far outside of a top can be of the wall below it."""
-FAR_OFF_M = 4.0e-4
-"""A circle that is so much wider or narrower than its type's is cut off by where its end is looked for."""
+FAR_OFF_M, MOST_AGAIN = 2.5e-4, 4
+"""A circle that is so much wider or narrower than it was looked for is cut off by where its end is looked for: it is
+looked for there, so often at most."""
+
+
+MIDDLE_SHARE, MIDDLE_POINTS = 0.6, 20
+"""The middle of a top, as a share of its radius, and how many points it has at least to tell what lies above it."""
+HIGHER_M = 2.0e-3
+"""What lies this far above a top is not of it: what a wrong pose is, more than a lean or noise make."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -140,8 +147,10 @@ def _names(
     """Types of all tops, and the radii of their circles, shape (T,), metres."""
     tops, shape = found.tops, top_shapes(found.tops, tubes, rack)
     circles, radius_m = found.circles, shape.radius_m + found.circles.widening_m
-    if np.any(np.abs(circles.widening_m[~shape.open]) > FAR_OFF_M):
+    for _ in range(MOST_AGAIN):
         # A circle that is far off its radius is measured again where it ends.
+        if not np.any(np.abs(circles.widening_m[~shape.open]) > FAR_OFF_M):
+            break
         again = replace(shape, radius_m=np.where(np.isfinite(radius_m), radius_m, shape.radius_m))
         _, circles = _measure_closed(found.points, found.label, tops, again, config)
         radius_m = again.radius_m + circles.widening_m
@@ -186,6 +195,33 @@ def top_measures(
     off = measured.center_m + down - rack.slot_centers_m[measured.tops.slot]
     columns = zip(height.tolist(), diameter.tolist(), off.tolist(), strict=True)
     return [TopMeasure(high, wide, (x, y)) for high, wide, (x, y) in columns]
+
+
+def higher_share(measured: Measured, tubes: Sequence[TubeModel], rack: RackModel) -> FloatArray:
+    """Share of the points over the middle of every top that are of a higher one, shape (T,).
+
+    A top is the highest thing over its slot. What is higher and no ghost lies at one height: the fullest two
+    millimetres count.
+
+    Args:
+        measured: The tops, T of them.
+        tubes: The candidate types.
+        rack: The rack.
+    """
+    count = len(measured.level_m)
+    if count == 0:
+        return np.zeros(0)
+    rows = np.flatnonzero(measured.label >= 0)
+    of, points_m = measured.label[rows], measured.points.points_m[rows]
+    radius_m = top_shapes(measured.tops, tubes, rack).radius_m
+    near = np.hypot(*(points_m[:, :2] - measured.center_m[of]).T) < MIDDLE_SHARE * radius_m[of]
+    of = of[near]
+    bins = np.ceil((points_m[near, 2] - measured.level_m[of] - HIGHER_M) / (HIGHER_M / 2)).astype(np.intp)
+    higher, width = bins > 0, max(int(bins.max(initial=0)), 1) + 2
+    inside = np.bincount(of, minlength=count)
+    counts = np.bincount(of[higher] * width + bins[higher], minlength=count * width).reshape(count, width)
+    fullest = (counts[:, :-1] + counts[:, 1:]).max(axis=1)
+    return np.asarray(fullest / np.maximum(inside, MIDDLE_POINTS))
 
 
 def label_points(standing: Standing, center_m: FloatArray, radius_m: FloatArray) -> NDArray[np.intp]:

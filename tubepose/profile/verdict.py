@@ -22,6 +22,7 @@ def tube_checks(
     *,
     sectors: float,
     allowed: float,
+    higher: float,
     high_m: float,
     tilt_std_rad: float,
     tube: TubeModel,
@@ -37,6 +38,7 @@ def tube_checks(
     Args:
         sectors: Share of the top's circle that was seen.
         allowed: Share of what the measurements leave open that the slot allows.
+        higher: Share of the points over its top's middle that lie above it.
         high_m: Height of a closed top above where it should be, metres; NaN for an open one.
         tilt_std_rad: Standard deviation of the tilt.
         tube: Its type.
@@ -62,6 +64,7 @@ def tube_checks(
         if np.isfinite(high_m):
             most_m = config.max_height_error_m
             yield Check("height_off", 1e3 * high_m, 1e3 * most_m, abs(high_m) <= most_m, detail=rack.name)
+        yield Check("something_higher", 100 * higher, 100 * config.max_higher, higher <= config.max_higher)
         where = f"{slot} of {rack.name}"
         yield Check("not_in_slot", allowed, config.min_allowed, allowed >= config.min_allowed, detail=where)
         std_deg, limit_deg = np.rad2deg(tilt_std_rad), np.rad2deg(config.max_tilt_std_rad)

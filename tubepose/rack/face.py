@@ -230,9 +230,11 @@ def _beside(standing: NDArray[np.bool_], cell_m: float) -> NDArray[np.bool_]:
 
 def _surrounded(some: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """Cells within the convex hull of those that have something: beyond it the image may have ended."""
-    places = np.argwhere(some)
+    rows = np.flatnonzero(some.any(axis=1))
     inside = np.zeros(some.shape, np.uint8)
-    if len(places) >= 3:
-        hull = cv2.convexHull(places[:, ::-1].astype(np.int32))
-        cv2.fillConvexPoly(inside, hull, 1)
+    if len(rows):
+        # The first and the last cell of every row have the hull of all of them.
+        first, last = some[rows].argmax(axis=1), some.shape[1] - 1 - some[rows, ::-1].argmax(axis=1)
+        ends = np.stack([np.concatenate([first, last]), np.concatenate([rows, rows])], axis=1)
+        cv2.fillConvexPoly(inside, cv2.convexHull(ends.astype(np.int32)), 1)
     return inside.astype(bool)

@@ -91,11 +91,23 @@ class Fit:
 
     def laid_flat(self, points_m: FloatArray, rack: RackModel) -> FloatArray:
         """Points (N, 3), camera frame, as they would lie were the face flat: moved by its bow where they are seen."""
-        if not self.bow_m.any():
-            return points_m
-        T = top_frame(self.T_camera_rack, rack)
-        points_m = np.ascontiguousarray(points_m, float)
-        return np.asarray(fit_kernels.laid_flat(points_m, *parts(T), camera_place(T), rack.outline_m / 2, self.bow_m))
+        return laid_flat(points_m, self.T_camera_rack, self.bow_m, rack)
+
+
+def laid_flat(points_m: FloatArray, T_camera_rack: FloatArray, bow_m: FloatArray, rack: RackModel) -> FloatArray:
+    """Points (N, 3), camera frame, as they would lie were a rack's face flat; NaN stays NaN.
+
+    Args:
+        points_m: The points, metres.
+        T_camera_rack: The rack's pose, shape (4, 4), metres.
+        bow_m: Of its face, as `Fit.bow_m`, shape (3,), metres.
+        rack: The rack.
+    """
+    if not bow_m.any():
+        return points_m
+    T = top_frame(T_camera_rack, rack)
+    points_m = np.ascontiguousarray(points_m, float)
+    return np.asarray(fit_kernels.laid_flat(points_m, *parts(T), camera_place(T), rack.outline_m / 2, bow_m))
 
 
 @dataclass(slots=True, eq=False)

@@ -18,18 +18,11 @@ from tubepose.capture.frame import CameraIntrinsics
 from tubepose.capture.hints import TurnHint
 from tubepose.config import Config, RackConfig
 from tubepose.labware import RackModel
-from tubepose.preprocessing import (
-    RackTop,
-    find_rack_top,
-    point_spacing_m,
-    remove_outliers,
-    thin,
-    to_o3d,
-    voxel_downsample,
-)
+from tubepose.preprocessing import point_spacing_m, remove_outliers, thin, to_o3d, voxel_downsample
 from tubepose.rack.insufficient import outline_words, too_coarse
 from tubepose.rack.pose import MIN_POINTS, RackPose, RackStatus
 from tubepose.rack.turns import choose_turn, unused_hint
+from tubepose.rack_band import RackTop, find_rack_top
 from tubepose.transforms import HALF_TURN, FloatArray, invert_transform, make_transform, transform_points, translation
 
 COVERED_WITHIN_M = 2.5e-3

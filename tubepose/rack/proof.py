@@ -178,7 +178,8 @@ def _measured(code: str, value: float, std: float, limit: float, words: tuple[st
 def _scale(size: FaceSize, rack: RackModel, distance_m: float, config: RackConfig) -> Iterator[Check]:
     """One scale of pitch and outline, by least squares: a cloud that is too large, or too small.
 
-    An outline's edge is moved by blur as well: its part is as sure as that.
+    An outline's edge is moved by blur as well: its part is as sure as that. Where neither what is seen nor the sensor's
+    calibration excludes a scale that moves the rack by what a wrong answer is, that is marked too.
     """
     scale, std = size.scale(rack, config.edge_std_mm * 1e-3)
     words = "larger" if scale > 0 else "smaller"
@@ -186,6 +187,8 @@ def _scale(size: FaceSize, rack: RackModel, distance_m: float, config: RackConfi
     # A mark costs little: one right file of twenty may have it.
     significant = abs(scale) > 2 * std and moved_mm > config.max_scale_shift_mm
     yield Check("scale", 100 * abs(scale), 0.1 * config.max_scale_shift_mm / distance_m, not significant, False, words)
+    unknown_mm, most_mm = 3e3 * distance_m / float(np.hypot(1 / std, 1 / config.scale_std)), config.max_scale_unknown_mm
+    yield Check("scale_unknown", unknown_mm, most_mm, unknown_mm <= most_mm, decides=False)
     limit = config.max_scale
     yield Check("scale", 100 * abs(scale), 100 * limit, abs(scale) - 3 * std <= limit, detail=words)
 

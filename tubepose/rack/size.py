@@ -126,8 +126,8 @@ def measure_size(face: Face, rack: RackModel) -> FaceSize:
     wrong = np.where(face.standing, rates.crossed, rates.stray)
     prior = PRIOR_STD**-2.0
     found, information, products, count = size_kernels.sizes(
-        face.places_m[near], np.nan_to_num(face.solid[near]), missed[near], wrong[near], face.weight, BLURS_M, ROUNDS,
-        prior, LONGEST, CLUSTER_M, inner.low_m, GRID_M, inner.shape, inner.table, outline.table,
+        face.places_m[near], np.nan_to_num(face.solid[near]), missed[near], wrong[near], face.shaded[near], face.weight,
+        BLURS_M, ROUNDS, prior, LONGEST, CLUSTER_M, inner.low_m, GRID_M, inner.shape, inner.table, outline.table,
     )  # fmt: skip
     inverse = np.linalg.inv(information)
     spread = inverse @ products @ inverse * (count / max(count - len(found), 1))

@@ -14,6 +14,9 @@ from tubepose.rack.fit_kernels import EDGE_SHIFT_M, WRONG_SHARE, cluster_sums
 UNKNOWNS = 8
 # Beyond so many blurs from an edge nothing pulls.
 REACH = 7.0
+# Cells so far inside the solid part tell how often what is solid looks open: beside tubes light is bent. Before any was
+# counted `WRONG_SHARE` is assumed, worth so many cells; no more than the largest share is believed.
+INSIDE_M, PRIOR_CELLS, MOST_SUNK = 1.0e-3, 20.0, 0.5
 
 
 @compiled
@@ -28,14 +31,16 @@ def _looked_up(x, y, low_m, cell_m, shape, table):
 
 
 @compiled
-def size_step(xy_m, solid, missed, wrong, weight, found, blur_m, low_m, cell_m, shape, openings, outline):
+def size_step(xy_m, solid, missed, wrong, shaded, sunk, weight, found, blur_m, low_m, cell_m, shape, openings, outline):
     """Information (8, 8) and scores (N, 8) of cells (N, 2) with a share of solid (N,), at some unknowns (8,).
 
     Cell by cell: P(solid) = w + (1 - e - w - m) logistic((shift - d) / blur), d the signed distance to the solid part,
-    w the share of open cells that look solid, m that of solid cells that are missed, 0 where something is shown.
+    w the share of open cells that look solid, m that of solid cells that are missed, 0 where something is shown, e that
+    of solid cells that look open: `sunk` (2,), beside what stands (`shaded`, (N,)) and elsewhere. The last is counted
+    anew: how many cells well inside the solid part there are, and how many of them look open, shape (2, 2).
     """
     information, scores = np.zeros((UNKNOWNS, UNKNOWNS)), np.zeros((len(xy_m), UNKNOWNS))
-    design, e = np.zeros(UNKNOWNS), WRONG_SHARE
+    design, inside = np.zeros(UNKNOWNS), np.zeros((2, 2))
     cos, sin = math.cos(found[0]), math.sin(found[0])
     for k in range(len(xy_m)):
         x, y = xy_m[k, 0] - found[1], xy_m[k, 1] - found[2]
@@ -45,11 +50,15 @@ def size_step(xy_m, solid, missed, wrong, weight, found, blur_m, low_m, cell_m, 
         inner += found[5]
         outer -= ox * ox * found[6] + oy * oy * found[7]
         distance = max(inner, outer)
+        zone = int(shaded[k])
+        if distance < -INSIDE_M and missed[k] == 0.0:
+            inside[zone, 0] += 1.0
+            inside[zone, 1] += 1.0 - solid[k]
         eta = (EDGE_SHIFT_M - distance) / blur_m
         if abs(eta) > REACH:
             continue
         plain = 1.0 / (1.0 + math.exp(-eta))
-        gain = 1.0 - e - wrong[k] - missed[k]
+        gain = 1.0 - sunk[zone] - wrong[k] - missed[k]
         if gain <= 0.0:
             continue
         chance, rate = wrong[k] + gain * plain, gain * plain * (1.0 - plain)
@@ -73,26 +82,45 @@ def size_step(xy_m, solid, missed, wrong, weight, found, blur_m, low_m, cell_m, 
     for i in range(UNKNOWNS):
         for j in range(i):
             information[j, i] = information[i, j]
-    return information, scores
+    return information, scores, inside
 
 
 @compiled
 def sizes(
-    xy_m, solid, missed, wrong, weight, blurs_m, rounds, prior, longest, side_m, low_m, cell_m, shape, openings, outline
+    xy_m,
+    solid,
+    missed,
+    wrong,
+    shaded,
+    weight,
+    blurs_m,
+    rounds,
+    prior,
+    longest,
+    side_m,
+    low_m,
+    cell_m,
+    shape,
+    openings,
+    outline,
 ):
     """Fisher scoring from 0 with a Gaussian prior (information (8,)): unknowns (8,), covariance (8, 8), squares.
 
-    The blur narrows round by round; no step is longer than `longest` (8,). The covariance is that of residuals alike
-    within squares of `side_m`, and no less than what the likelihood says.
+    The blur narrows round by round; no step is longer than `longest` (8,). How often what is solid looks open is
+    counted anew in every round. The covariance is that of residuals alike within squares of `side_m`, and no less than
+    what the likelihood says.
     """
-    found = np.zeros(UNKNOWNS)
+    found, sunk = np.zeros(UNKNOWNS), np.full(2, WRONG_SHARE)
     information = np.zeros((UNKNOWNS, UNKNOWNS))
     scores = np.zeros((len(xy_m), UNKNOWNS))
     for blur_m in blurs_m:
         for _ in range(rounds):
-            information, scores = size_step(
-                xy_m, solid, missed, wrong, weight, found, blur_m, low_m, cell_m, shape, openings, outline
+            information, scores, inside = size_step(
+                xy_m, solid, missed, wrong, shaded, sunk, weight, found, blur_m, low_m, cell_m, shape, openings, outline
             )
+            for zone in range(2):
+                share = (inside[zone, 1] + WRONG_SHARE * PRIOR_CELLS) / (inside[zone, 0] + PRIOR_CELLS)
+                sunk[zone] = min(max(share, WRONG_SHARE), MOST_SUNK)
             total = np.zeros(UNKNOWNS)
             for i in range(UNKNOWNS):
                 information[i, i] += prior[i]

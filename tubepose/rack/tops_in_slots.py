@@ -9,6 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from tubepose.labware import RackModel
 from tubepose.preprocessing import thin
@@ -67,10 +68,9 @@ def tops_in_slots(points_m: FloatArray, T_camera_top: FloatArray, bow_m: FloatAr
     local = to_frame(thin(above, POINTS_PER_SLOT * len(centers)), T_camera_top)
     slopes = bow_slopes(bow_m, centers, rack)
     found, offsets = [], []
-    for k in range(len(centers)):
-        apart = local[:, :2] - centers[k]
-        near = np.flatnonzero((np.abs(apart) < 1.5 * WINDOW * pitches[k]).all(axis=1))
-        offset = _middle(apart[near], local[near, 2], float(pitches[k]))
+    tree = cKDTree(local[:, :2])
+    for k, near in enumerate(tree.query_ball_point(centers, 1.5 * WINDOW * pitches, p=np.inf, return_sorted=True)):
+        offset = _middle(local[near, :2] - centers[k], local[near, 2], float(pitches[k]))
         if offset is not None:
             found.append(k)
             offsets.append(offset[:2] + offset[2] * slopes[k])

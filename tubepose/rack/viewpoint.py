@@ -16,8 +16,8 @@ from tubepose.transforms import FloatArray, invert_transform, transform_points, 
 # Beyond this angle off its normal a face is foreshortened to a third: its openings close, and no sensor of this kind
 # sees its ribs. A robot's base stands about as high as the rack, and sees its face from the side or from below.
 MOST_INCIDENCE_DEG = 70.0
-# Points so far behind the face are of nothing that is bowed (2.5 mm) or noisy there.
-BEHIND_M = 4e-3
+# Points so far behind the face are of nothing that is bowed (2.5 mm) or noisy there, nor of light that a tube has bent.
+BEHIND_M = 10e-3
 # Lines of sight this far inside the solid part are not of an edge: blur, and light from below a surface.
 INSIDE_M = 1.5e-3
 # Fewer points behind the face, or a smaller share of the face that deep in the solid part, decide nothing.

@@ -9,8 +9,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from tubepose.detection import best_rack
 from tubepose.occupancy import stated_slots
-from tubepose.pipeline import Scene, TubeEstimate, best_rack
+from tubepose.scene import Scene, TubeEstimate
 from tubepose.slots import SlotState
 from tubepose.transforms import FloatArray, transform_points
 from tubepose.tube import TubeStatus

@@ -75,6 +75,11 @@ class SensorNoise:
     edge_source: str = PRIOR
     note: str = ""
 
+    @property
+    def depth_std_m(self) -> float:
+        """Standard deviation of one point's depth, its own error and the shared one, metres."""
+        return float(np.hypot(self.independent_m, self.shared_m))
+
     def slope_std(self, radius_m: float, distance_m: float) -> float:
         """Standard deviation of each slope of a least-squares plane through a disc of points.
 

@@ -116,7 +116,8 @@ def _collides(solid: Solid, others: Sequence[Solid], cap: CapModel) -> bool:
 def _fits(rack: RackModel, slot: SlotModel, model: TubeModel, cap: CapModel) -> bool:
     """Whether the tube goes into the slot, and its printed cap's plate stays above the rack."""
     z, r = model.outer_profile_m().T
-    widest = float(r[z <= rack.depth_m].max())
+    # A tapered body is widest at the rack's top, where its profile need not have a point.
+    widest = max(float(r[z <= rack.depth_m].max()), float(model.body_radius_m(opening_height_m(rack, model))))
     room = -float(slot.signed_distance_m(slot.center_m))
     plate_low = cap.offset_m(model) - cap.thickness_mm * 1e-3
     return widest + CLEARANCE_M < room and plate_low > rack.depth_m + 1e-3

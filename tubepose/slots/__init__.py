@@ -10,6 +10,7 @@ from tubepose.slots.assignment import (
     points_above,
     slot_shares,
 )
+from tubepose.slots.cells import slot_cores_m
 from tubepose.slots.look import SlotLook, look_at_slots
 from tubepose.slots.state import Finding, SlotState, StatedSlot, state_slot
 
@@ -26,6 +27,7 @@ __all__ = [
     "lean_reach_m",
     "look_at_slots",
     "points_above",
+    "slot_cores_m",
     "slot_shares",
     "state_slot",
 ]

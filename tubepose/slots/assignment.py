@@ -29,14 +29,14 @@ class SlotAssignment:
     Attributes:
         detection: Index of the detection.
         slot: Name of the slot, or None if the tube stands on none.
-        share: Share of the projected hull's area that lies in that slot's opening.
+        hull_share: Share of the projected hull's area that lies in that slot's opening.
         why: Why there is no slot; None where there is one.
         points_m: The tube's points above the rack's top, rack frame, shape (N, 3), metres.
     """
 
     detection: int
     slot: str | None
-    share: float
+    hull_share: float
     why: Check | None
     points_m: FloatArray
 

@@ -170,3 +170,17 @@ def telling_cells(
     for height in np.linspace(0.0, out_m, LEVELS):
         telling |= np.hypot(*(q + rise * height).T) < (radius - loss * height)[cells.slot]
     return telling
+
+
+def slot_cores_m(rack: RackModel, tubes: Sequence[TubeModel], cell_m: float = 1.0e-3) -> dict[str, FloatArray]:
+    """Cells of every slot's core (`core_cells`), by its name, shape (K, 2) each, rack frame, metres.
+
+    Args:
+        rack: The rack.
+        tubes: Types that can stand in it.
+        cell_m: Side of a cell, metres.
+    """
+    cells = opening_cells(rack, cell_m)
+    inside = core_cells(cells, rack, tubes)
+    rows = cells.slot[inside]
+    return {slot.name: cells.center_m[inside][rows == k] for k, slot in enumerate(rack.all_slots)}

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from tubepose.capture.frame import CameraIntrinsics, RgbdFrame
 from tubepose.labware import RackModel
 from tubepose.preprocessing import TALLEST_TUBE_M, thin
+from tubepose.rack.fit import laid_flat
 from tubepose.slots.cells import OpeningCells, empty_height_m, opening_cells
 from tubepose.slots.sight_kernels import KINDS, PASSED, Heights, Pixels, follow_lines
 from tubepose.transforms import FloatArray, invert_transform, parts, transform_points
@@ -23,7 +24,9 @@ SPACINGS = 1.5
 SAMPLE = 20_000
 """Points that tell how dense a cloud without pixels is."""
 BOW_M = 2.5e-3
-"""How far a rack's face may bow off its plane, metres: real plastic racks."""
+"""How far a rack's face may bow off its plane where its bow is not known, metres: real plastic racks."""
+FACE_M = 1.0e-3
+"""The same where it is known: the bow of higher order, and rounded ribs."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -54,6 +57,7 @@ def follow_sight(
     T_camera_rack: FloatArray,
     rack: RackModel,
     depth_std_m: float,
+    bow_m: FloatArray | None = None,
 ) -> FollowedLines | None:
     """Follow every line of sight that can tell something of a rack's slots.
 
@@ -66,6 +70,7 @@ def follow_sight(
         T_camera_rack: The rack's pose, shape (4, 4), metres.
         rack: The rack.
         depth_std_m: Standard deviation of a point's depth, metres.
+        bow_m: Bow of the rack's face, shape (3,), metres: points are laid flat by it. None where it is not known.
 
     Returns:
         What became of them; None where the camera is not above the rack's face.
@@ -80,10 +85,13 @@ def follow_sight(
         pixels = Pixels(np.ascontiguousarray(measured_m[None]), (0, 0), 1, (0.0, 0.0, 0.0, 0.0))
         spacing_m = _spacing_m(measured_m, rotation, camera_m, rack)
         intrinsics = None
+    if bow_m is not None and bow_m.any():
+        flat_m = laid_flat(pixels.cloud_m.reshape(-1, 3), T_camera_rack, bow_m, rack)
+        pixels = pixels._replace(cloud_m=flat_m.reshape(pixels.cloud_m.shape))
     cells = opening_cells(rack, _cell_m(spacing_m))
     empty_m = np.full(cells.cell.shape, np.nan)
     empty_m[cells.cell >= 0] = empty_height_m(cells, rack, camera_m)
-    band_m = BOW_M + 3 * depth_std_m
+    band_m = (BOW_M if bow_m is None else FACE_M) + 3 * depth_std_m
     heights = Heights(rack.height_m, band_m, band_m + 2e-3 * rack.floor_tolerance_mm)
     counts, covered = follow_lines(
         pixels, rotation, camera_m, heights, cells.low_m, cells.cell_m, cells.owner, empty_m

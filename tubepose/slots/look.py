@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -43,8 +43,8 @@ class SlotLook:
         seen_share: Share that was looked at: lines that went in or met the slot's own content, or `covered` if larger.
         patches_passed: Patches of 3 x 3 mm whose lines went on where a tube in the slot would have stopped them
             (`contradicting_m2`): lines into the opening, and those through the column above it that ended behind it.
-        patches_stopped: Patches whose lines had to meet what stands in the slot and met something there, or of its
-            middle that is covered, if more.
+        patches_stopped: Patches whose lines had to meet what stands in the slot and met something there.
+        patches_covered: Patches of the slot's middle that is covered.
     """
 
     slot: str
@@ -59,6 +59,17 @@ class SlotLook:
     seen_share: float
     patches_passed: float
     patches_stopped: float
+    patches_covered: float = 0.0
+
+    def explained(self, share: float) -> SlotLook:
+        """The same, less a share of the slot's middle that tubes of other slots reach over.
+
+        Args:
+            share: Of the slot's middle, as seen along the rack's normal, 0 to 1.
+        """
+        left = max(self.covered - share, 0.0)
+        patches = self.patches_covered * left / self.covered if self.covered > 0 else 0.0
+        return replace(self, covered=left, patches_covered=patches)
 
 
 def look_at_slots(
@@ -68,6 +79,7 @@ def look_at_slots(
     rack: RackModel,
     tubes: Sequence[TubeModel] = (),
     depth_std_m: float = DEPTH_STD_M,
+    bow_m: FloatArray | None = None,
 ) -> tuple[SlotLook, ...]:
     """Compute what was seen of every slot by following every line of sight to its end.
 
@@ -78,14 +90,15 @@ def look_at_slots(
         rack: The rack.
         tubes: Types that can stand in it: how wide they are tells which lines of sight must meet one.
         depth_std_m: Standard deviation of a point's depth, metres.
+        bow_m: Bow of the rack's face (`RackPose.bow_m`), shape (3,), metres; None where it is not known.
 
     Returns:
         One for each of `rack.all_slots`, in their order. Of a camera below the rack's face: nothing seen.
     """
-    lines = follow_sight(frame, intrinsics, T_camera_rack, rack, depth_std_m)
+    lines = follow_sight(frame, intrinsics, T_camera_rack, rack, depth_std_m, bow_m)
     n_slots = len(rack.all_slots)
     if lines is None:
-        return tuple(SlotLook(slot.name, *[0.0] * 11) for slot in rack.all_slots)
+        return tuple(SlotLook(slot.name, *[0.0] * 12) for slot in rack.all_slots)
     cells, kinds = lines.cells, lines.kinds
 
     def per_slot(values: NDArray[Any]) -> FloatArray:
@@ -99,10 +112,11 @@ def look_at_slots(
     core = core_cells(cells, rack, tubes)
     covered = per_slot(core & lines.covered)
     stops = kinds[:, STANDING] + kinds[:, FILLED]
-    stopped = np.maximum(per_slot(telling_cells(cells, rack, tubes, lines.camera_m) * stops), covered)
+    stopped = per_slot(telling_cells(cells, rack, tubes, lines.camera_m) * stops)
     passed_m2 = contradicting_m2(lines.passing, cells, rack, tubes, lines.camera_m)
+    cell_patches = cells.cell_m**2 / PATCH_M**2
+    patches = (passed_m2 / PATCH_M**2, stopped * cell_patches, covered * cell_patches)
     covered = covered / np.maximum(per_slot(core), 1)
     seen = np.maximum(shares[:, [PASSED, STANDING, FILLED, AT_FACE]].sum(axis=1), covered)
-    patches = (passed_m2 / PATCH_M**2, stopped * cells.cell_m**2 / PATCH_M**2)
     table = np.column_stack([in_image, shares, covered, seen, *patches]).tolist()
     return tuple(SlotLook(slot.name, *row) for slot, row in zip(rack.all_slots, table, strict=True))

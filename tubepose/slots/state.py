@@ -82,6 +82,11 @@ class StatedSlot:
     seen_share: float
 
 
+def patches_stopped(look: SlotLook) -> float:
+    """Patches that say that something stands in a slot: its lines of sight or its covered middle, whichever is more."""
+    return max(look.patches_stopped, look.patches_covered)
+
+
 def p_occupied(look: SlotLook, prior: float = PRIOR_OCCUPIED) -> float:
     """Probability that something opaque stands in a slot, from its patches: naive Bayes, a Bernoulli law per patch.
 
@@ -95,7 +100,7 @@ def p_occupied(look: SlotLook, prior: float = PRIOR_OCCUPIED) -> float:
     stopped = np.log((1 - PASSES_OCCUPIED) / (1 - PASSES_EMPTY))
     passed = np.log(PASSES_OCCUPIED / PASSES_EMPTY)
     log_odds = np.log(prior / (1 - prior))
-    log_odds += look.patches_stopped * stopped + look.patches_passed * passed
+    log_odds += patches_stopped(look) * stopped + look.patches_passed * passed
     p = 1 / (1 + np.exp(-np.clip(log_odds, -50, 50)))
     return float(MISSED * prior + (1 - MISSED) * p)
 
@@ -109,13 +114,13 @@ def state_slot(look: SlotLook | None, finding: Finding) -> StatedSlot:
     """
     share = look.seen_share if look is not None else float("nan")
     prior = PRIOR_OCCUPIED if finding is Finding.NONE else PRIOR_DOUBTFUL
-    seen = look is not None and look.patches_passed + look.patches_stopped >= LEAST_PATCHES
+    seen = look is not None and look.patches_passed + patches_stopped(look) >= LEAST_PATCHES
     p = p_occupied(look, prior) if look is not None and seen else prior
     if finding is Finding.TUBE:
         return StatedSlot(SlotState.OCCUPIED, max(p, ACCEPTED), share)
     if look is None or not seen:
         return StatedSlot(SlotState.NOT_SEEN if finding is Finding.NONE else SlotState.UNCLEAR, p, share)
-    passed, stopped = look.patches_passed, look.patches_stopped
+    passed, stopped = look.patches_passed, patches_stopped(look)
     state = SlotState.UNCLEAR
     solid = finding is not Finding.NONE or look.covered + look.filled >= LEAST_COVERED
     if p >= SURE and passed <= MOST_DISSENT * stopped and solid:

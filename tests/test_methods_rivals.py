@@ -11,15 +11,16 @@ import pytest
 import scenes
 from commands import tubepose
 
-from tubepose import rivals
+from tubepose import methods
 from tubepose.config import Config, RivalsConfig
 from tubepose.errors import TubePoseError
 from tubepose.labware import load_rack, load_tube
+from tubepose.methods import METHODS, require_methods
+from tubepose.methods.gicp import fit_gicp
+from tubepose.methods.kiss_matcher import fit_kiss_matcher
 from tubepose.provenance import pinned_threads
-from tubepose.rivals import PACKAGES, fit_gicp, fit_kiss_matcher, require_packages, settings_note
 from tubepose.transforms import axis_rotation, tilt_rad
 from tubepose.tube import TubeStatus
-from tubepose_cli.bench import _rival_notes
 
 REPOSITORY = Path(__file__).resolve().parent.parent
 CONFIG = Config()
@@ -28,12 +29,13 @@ SLOT = RACK.slot("C4")
 TUBES = [load_tube(f"chen2023-tube-{i}") for i in (1, 2, 3)]
 ASIDE = np.array([np.sin(0.3), 0.0, np.cos(0.3)])
 ABOVE_M = RACK.height_m + CONFIG.slots.clearance_m
-METHODS = {"kiss-matcher": fit_kiss_matcher, "gicp": fit_gicp}
+FITS = {"kiss-matcher": fit_kiss_matcher, "gicp": fit_gicp}
+PACKAGES = {name: METHODS[name].packages for name in FITS}
 
 
 def installed(method):
     try:
-        require_packages([method])
+        require_methods([method])
     except TubePoseError as problem:
         return str(problem)
     return ""
@@ -44,7 +46,7 @@ def needs(method):
     return pytest.mark.skipif(bool(missing), reason=missing)
 
 
-EACH = [pytest.param(name, marks=needs(name)) for name in METHODS]
+EACH = [pytest.param(name, marks=needs(name)) for name in FITS]
 
 
 def leaning(tube, alpha_deg=0.8, beta_deg=-0.6, off_m=(0.6e-3, -0.4e-3)):
@@ -115,14 +117,14 @@ def test_other_settings_of_kiss_matcher_are_answered_too(settings):
 def test_the_same_seed_gives_the_same_pose(name):
     points, _ = leaning(TUBES[1])
     with pinned_threads(1):  # as every command does: sums of several threads differ in the last bit
-        poses = [METHODS[name](points, SLOT, TUBES[1], RACK, changed(kiss_attempts=8), 3).T_rack_tube for _ in range(2)]
+        poses = [FITS[name](points, SLOT, TUBES[1], RACK, changed(kiss_attempts=8), 3).T_rack_tube for _ in range(2)]
     assert np.array_equal(poses[0], poses[1])
 
 
 @pytest.mark.parametrize("name", EACH)
 def test_the_spin_is_fixed_by_the_rule_of_eq_1(name):
     points, _ = leaning(TUBES[1])
-    T = METHODS[name](points, SLOT, TUBES[1], RACK, changed(kiss_attempts=8), 0).T_rack_tube
+    T = FITS[name](points, SLOT, TUBES[1], RACK, changed(kiss_attempts=8), 0).T_rack_tube
     assert np.allclose(T[:3, :3], axis_rotation(T[:3, 2]), atol=1e-9)
 
 
@@ -130,7 +132,7 @@ def test_the_spin_is_fixed_by_the_rule_of_eq_1(name):
 @pytest.mark.parametrize("count", [0, 1, 5])
 def test_too_few_points_fail_without_a_pose(name, count):
     points, _ = leaning(TUBES[1])
-    pose = METHODS[name](points[:count], SLOT, TUBES[1], RACK, CONFIG, 0)
+    pose = FITS[name](points[:count], SLOT, TUBES[1], RACK, CONFIG, 0)
     assert (pose.status, pose.T_rack_tube, pose.n_points) == (TubeStatus.FAILED, None, count)
     assert "at least 10 expected" in pose.reason
 
@@ -191,7 +193,7 @@ def test_a_missing_package_is_named_with_what_to_install(monkeypatch, name, pack
     monkeypatch.setitem(sys.modules, package, None)  # importing it raises ImportError
     points, _ = leaning(TUBES[1])
     with pytest.raises(TubePoseError, match=r"pip install '\.\[rivals\]'") as told:
-        METHODS[name](points, SLOT, TUBES[1], RACK, CONFIG, 0)
+        FITS[name](points, SLOT, TUBES[1], RACK, CONFIG, 0)
     assert f"method '{name}' needs the package {package}" in str(told.value)
     assert "\n" not in str(told.value)
 
@@ -208,26 +210,23 @@ def test_bench_without_the_extra_ends_before_any_work(monkeypatch, tmp_path):
 def test_methods_without_extras_need_nothing(monkeypatch):
     for package in {entry for entries in PACKAGES.values() for entry in entries}:
         monkeypatch.setitem(sys.modules, package, None)
-    require_packages(["paper", "upright", "slot-icp", "global-icp"])
+    require_methods(["paper", "upright", "slot-icp", "global-icp"])
 
 
 def test_notes_name_the_settings_that_ran():
     config = changed(kiss_attempts=7, gicp_kind="PLANE_ICP", gicp_target="scan", gicp_max_distance_m=(3e-3, 1e-3))
-    gicp = settings_note("gicp", config, 2)
+    gicp = METHODS["gicp"].note(config, 2)
     assert gicp.startswith("gicp: small_gicp PLANE_ICP, template onto scan, distances 3, 1 mm")
-    kiss = settings_note("kiss-matcher", config, 2)
+    kiss = METHODS["kiss-matcher"].note(config, 2)
     assert "best of 7 draws of 200 pairs, 2 seeds; then small_gicp PLANE_ICP" in kiss
-    assert "then ICP as slot-icp" in settings_note("kiss-matcher", changed(kiss_refinement="icp"), 2)
-    assert "GNC without pruning" in settings_note("kiss-matcher", changed(kiss_pruning=False), 2)
+    assert "then ICP as slot-icp" in METHODS["kiss-matcher"].note(changed(kiss_refinement="icp"), 2)
+    assert "GNC without pruning" in METHODS["kiss-matcher"].note(changed(kiss_pruning=False), 2)
 
 
-def test_a_table_names_only_the_rivals_that_ran():
-    def told(*methods):
-        return [note.split(":")[0] for note in _rival_notes(methods, CONFIG, 2)]
-
-    assert told("upright", "paper", "slot-icp") == []
-    assert told("gicp", "paper") == ["gicp"]
-    assert told("kiss-matcher", "global-icp", "gicp") == ["global-icp", "kiss-matcher", "gicp"]
+def test_the_global_baselines_and_gicp_say_their_settings_and_no_other_does():
+    told = {name: method.note(CONFIG, 2).split(":")[0] for name, method in METHODS.items()}
+    assert {name for name, first in told.items() if first} == {"global-icp", "kiss-matcher", "gicp"}
+    assert all(first in ("", name) for name, first in told.items())
 
 
 @pytest.mark.parametrize("group", ["kiss_settings", "gicp_settings"])
@@ -242,6 +241,7 @@ def test_compared_settings_change_one_thing_each(group):
 
 
 def test_the_packages_are_imported_by_functions_only():
-    tree = ast.parse(Path(rivals.__file__).read_text())
-    nodes = [node for node in tree.body if isinstance(node, ast.Import | ast.ImportFrom)]
+    trees = [ast.parse(path.read_text()) for path in Path(methods.__file__).parent.glob("*.py")]
+    nodes = [node for tree in trees for node in tree.body if isinstance(node, ast.Import | ast.ImportFrom)]
+    nodes = [node for node in nodes if "tubepose" not in ast.unparse(node)]
     assert not set(re.findall(r"kiss_matcher|small_gicp", " ".join(map(ast.unparse, nodes))))

@@ -7,8 +7,9 @@ import scenes
 from tubepose.checks import failed, sentence
 from tubepose.config import Config, TubeConfig
 from tubepose.labware import load_rack, load_tube
+from tubepose.methods.paper import _COSTS, axis_distance_m, clearance_m, fit_cylinder, fit_tube, wall_checks
 from tubepose.transforms import tilt_rad, tilt_rotation
-from tubepose.tube import _COSTS, TubeStatus, axis_distance_m, clearance_m, fit_cylinder, fit_tube, wall_checks
+from tubepose.tube import TubeStatus
 
 CONFIG = Config()
 RACK = load_rack("chen2023-soft-5x10")
@@ -89,8 +90,8 @@ def test_tilts_within_the_slot_are_recovered(tube, lean):
     assert np.rad2deg(tilt_rad(pose.T_rack_tube[:3, 2], true[:, 2])) < 0.12
     assert np.allclose(pose.T_rack_tube[:3, :3], true, atol=3e-3)
     assert np.array_equal(pose.T_rack_tube[:3, 3], ORIGIN_M)
-    assert pose.fitness > 0.95
-    assert pose.inlier_rmse_m < 2e-4
+    assert pose.inside_share > 0.95
+    assert pose.excess_rms_m < 2e-4
     assert pose.n_points == min(len(points), CONFIG.preprocess.tube_max_points)
 
 
@@ -220,11 +221,11 @@ def test_fewer_points_than_the_least_are_rejected_without_a_pose(count):
     assert [(check.value, check.limit) for check in pose.checks] == [(count, 25)]
 
 
-def test_points_of_something_else_lower_the_fitness():
+def test_points_of_something_else_lower_the_share_inside():
     clean = seen(TUBE_2)
     other = np.random.default_rng(0).normal([*SLOT.center_m, 0.09], 0.012, (len(clean) // 2, 3))
     mixed = np.random.default_rng(1).permutation(np.vstack([clean, other]))
     good = fit_tube(clean, SLOT, TUBE_2, RACK, CONFIG)
     bad = fit_tube(mixed, SLOT, TUBE_2, RACK, CONFIG)
-    assert bad.fitness < good.fitness - 0.1
-    assert bad.inlier_rmse_m > 3 * good.inlier_rmse_m
+    assert bad.inside_share < good.inside_share - 0.1
+    assert bad.excess_rms_m > 3 * good.excess_rms_m

@@ -1,12 +1,14 @@
-"""The rivals: what they recover on clean clouds, and that they fail aloud."""
+"""The baselines of Open3D: what they recover on clean clouds, and that they fail aloud."""
 
 import numpy as np
 import pytest
 import scenes
 
-from tubepose.baselines import fit_global_icp, fit_slot_icp, fit_upright
 from tubepose.config import Config, IcpConfig
 from tubepose.labware import load_rack, load_tube
+from tubepose.methods.global_icp import fit_global_icp
+from tubepose.methods.slot_icp import fit_slot_icp
+from tubepose.methods.upright import fit_upright
 from tubepose.transforms import axis_rotation, tilt_rad
 from tubepose.tube import TubeStatus
 
