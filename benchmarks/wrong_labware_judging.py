@@ -237,7 +237,7 @@ def _tube_verdicts(truth: Truth, answer: Answer) -> Iterator[Verdict]:
         if nearest is None or _apart_m(stated, nearest) > NEAR_M:
             yield Verdict(tubes=1, wrong_type=1, wrong_tubes=1)
             continue
-        across, along, angle = _errors(stated.T_camera_tube, nearest.T_camera_tube)
+        across, along, angle = _errors(_but_for_marks(stated, nearest, answer), nearest.T_camera_tube)
         shown = nearest.model.cap is not None and not nearest.model.cap.open
         far = abs(along) > WRONG_M
         faults = (
@@ -250,6 +250,16 @@ def _tube_verdicts(truth: Truth, answer: Answer) -> Iterator[Verdict]:
         wrong = int(any(faults))
         kept, unseen = 1 - wrong, int(far and not shown)
         yield Verdict(0, 0, 0, 1, kept, 0, unseen, 0, *faults, wrong)
+
+
+def _but_for_marks(stated: StatedTube, tube: TrueTube, answer: Answer) -> FloatArray:
+    """T_camera_tube of a stated tube, without what its rack's mark says to be unknown: the distance along the sight."""
+    if not answer.marks & SCALE_MARKS:
+        return stated.T_camera_tube
+    sight = tube.T_camera_tube[:3, 3] / np.linalg.norm(tube.T_camera_tube[:3, 3])
+    T = stated.T_camera_tube.copy()
+    T[:3, 3] -= ((T[:3, 3] - tube.T_camera_tube[:3, 3]) @ sight) * sight
+    return T
 
 
 def _apart_m(stated: StatedTube, tube: TrueTube) -> float:

@@ -80,7 +80,8 @@ def test_noise_lives_in_pixels_so_caps_farther_off_say_the_same():
 
 
 @pytest.mark.parametrize(
-    ("source", "times", "believed"), [(RACK_TOP, 4.0, CAPS), (RACK_TOP, 0.5, RACK_TOP), (TABLE, 4.0, TABLE)]
+    ("source", "times", "believed"),
+    [(RACK_TOP, 4.0, CAPS), (RACK_TOP, 0.5, RACK_TOP), (TABLE, 1.0, TABLE), (TABLE, 0.5, TABLE)],
 )
 def test_caps_are_believed_against_a_racks_top_that_reads_too_high(source, times, believed):
     discs, _ = caps(1e-4, 1e-4, 3e-3)
@@ -92,6 +93,21 @@ def test_caps_are_believed_against_a_racks_top_that_reads_too_high(source, times
     assert ("rack's top has" in found.note) == (believed == CAPS)
     if believed != CAPS:
         assert found == surface
+
+
+@pytest.mark.parametrize(("own_m", "shared_m"), [(1e-4, 1e-4), (3e-5, 1e-4), (1e-4, 1e-5)])
+@pytest.mark.parametrize("times", [1.0, 2.0])
+def test_a_table_that_is_noisier_than_the_caps_is_scaled(own_m, shared_m, times):
+    discs, _ = caps(own_m, shared_m, 3e-3, count=40)
+    table = replace(
+        prior_noise(SensorConfig()), source=TABLE, shared_m=times * shared_m, independent_m=times * own_m,
+        correlation_m=3e-3, spacing_m=SPACING_M, independent_relative_std=0.02, shared_relative_std=0.05,
+    )  # fmt: skip
+    found = seen_on_caps(table, discs)
+    assert found.source == TABLE
+    assert found.independent_m == pytest.approx(own_m, rel=0.15)
+    assert found.shared_m == pytest.approx(shared_m, rel=0.15)
+    assert ("the table has 2" in found.note) == (times == 2.0)
 
 
 def test_too_few_points_say_nothing():

@@ -14,32 +14,26 @@ import numpy as np
 from tubepose.capture.frame import RgbdFrame
 from tubepose.config import Config
 from tubepose.errors import LabwareError
-from tubepose.labware import RackModel, SlotGrid, SlotShape
+from tubepose.labware import RackModel
 from tubepose.labware.definition import LONGEST_NAME
 from tubepose.rack.alternatives import line_steps_m
-from tubepose.rack.edges import best_registration, coarse_sample
-from tubepose.rack.grid import coarse_racks
-from tubepose.rack.lattice import SlotLattice
-from tubepose.rack.periods import propose_lattices
+from tubepose.rack.resizing import LEAST_RIB_MM, register_unsized
 from tubepose.rack.rib_edges import RibStretch, measure_ribs
-from tubepose.rack.search import levels
-from tubepose.rack.settling import Registration, register_at
+from tubepose.rack.settling import Registration
 from tubepose.rack.size import FaceSize
 from tubepose.sensor.surfaces import table_beside
 from tubepose.standing_tops import TopKind, kinds_of_tops, measure_tops
-from tubepose.transforms import QUARTER_TURN, FloatArray, invert_transform, transform_points
+from tubepose.transforms import FloatArray, invert_transform, transform_points
 
-ROUNDS = 6
-SETTLED_MM = 0.01
-ODD_MM = 1.5
-"""Openings that are longer than wide by less are taken for squares: one edge is told no better."""
 OPENING_SHIFT_MM = 0.48
 """By so much openings look narrower: right below the face their walls count as face (SIMULATED scans, racks of the
 catalogue, two resolutions: 0.3 to 0.7)."""
 OPENING_STD_MM = 0.14
 OUTLINE_STD_MM = 0.24
 """What blur leaves of openings and outlines, standard deviations (the same scans)."""
-LEAST_RIB_MM = 0.8
+BLUR_SIGMAS = 1.8
+DEPTH_STD_MM = 0.3
+"""The floor of a slot is seen past its walls, whose light lifts it."""
 PITCH_STD = 8e-4
 """A camera's scale, as a share of every pitch."""
 RIB_WINDOW_M = 1.0e-3
@@ -104,14 +98,7 @@ def measure_rack(frame: RgbdFrame, config: Config, like: RackModel | None = None
         LabwareError: No rack is found.
     """
     points_m = frame.measured_m
-    if like is not None:
-        few_m = coarse_sample(points_m, config.rack_top)
-        found = best_registration(points_m, few_m, levels(few_m, config.rack_top), like, config)
-        starts = [] if found is None or found.size is None else [(like, found)]
-    else:
-        starts = [_upright(points_m, *one, config) for one in _unknown(points_m, config)]
-    settled = [_settled(points_m, *start, config) for start in starts]
-    best = max(settled, key=lambda pair: pair[1].log_likelihood, default=None)
+    best = register_unsized(points_m, config, like)
     if best is None:
         words = f"like {like.name}" if like is not None else "of slots in rows and columns"
         raise LabwareError(
@@ -119,113 +106,6 @@ def measure_rack(frame: RgbdFrame, config: Config, like: RackModel | None = None
             "empty; --like NAME|FILE measures one that is like another, whatever its slots"
         )
     return _described(frame, points_m, *best, config, like)
-
-
-def _unknown(points_m: FloatArray, config: Config) -> Iterator[tuple[RackModel, Registration]]:
-    """Racks that slots of unknown pitch could make, each with its registration; openings square and round."""
-    for lattice in propose_lattices(points_m, config):
-        found = False
-        for shape in _shapes(lattice):
-            for T_camera_rack, rack in coarse_racks(points_m, shape, config):
-                registration = register_at(points_m, T_camera_rack, rack, config.rack)
-                if registration.size is not None:
-                    yield rack, registration
-                    found = True
-                    break
-        if found:
-            return
-
-
-def _shapes(lattice: SlotLattice) -> Iterator[SlotLattice]:
-    size = lattice.slot.size_mm
-    if lattice.slot.shape == "square" and abs(size[0] - size[1]) < ODD_MM:
-        size = (sum(size) / 2, sum(size) / 2)
-        lattice = replace(lattice, slot=SlotShape(shape="square", size_mm=size))
-    yield lattice
-    if lattice.slot.shape == "round":
-        side = size[0] * float(np.sqrt(np.pi) / 2)
-        yield replace(lattice, slot=SlotShape(shape="square", size_mm=(side, side)))
-    elif abs(size[0] - size[1]) < 0.3 * max(size):
-        wide = float(min(np.sqrt(size[0] * size[1] * 4 / np.pi), 0.97 * min(lattice.pitch_mm)))
-        yield replace(lattice, slot=SlotShape(shape="round", size_mm=(wide, wide)))
-
-
-def _settled(
-    points_m: FloatArray, rack: RackModel, found: Registration, config: Config
-) -> tuple[RackModel, Registration]:
-    """Measure, take the sizes over, register again, until nothing changes."""
-    for _ in range(ROUNDS):
-        assert found.size is not None
-        better = _resized(rack, found)
-        if better is None:
-            break
-        again = register_at(points_m, found.fit.T_camera_rack, better, config.rack)
-        if again.size is None:
-            break
-        moved = max(
-            float(np.abs(np.array(better.outline_mm) - rack.outline_mm).max()),
-            float(np.abs(np.array(better.all_slots[0].size_mm) - rack.all_slots[0].size_mm).max()),
-            1e3 * float(np.abs(better.slot_centers_m - rack.slot_centers_m).max()),
-        )
-        rack, found = better, again
-        if moved < SETTLED_MM:
-            break
-    return rack, found
-
-
-def _resized(rack: RackModel, found: Registration) -> RackModel | None:
-    """The rack with the sizes that its registration measured; None where that is no rack."""
-    size = found.size
-    assert size is not None
-    stretch = 1 + size.stretch
-    # A sensor that loses the edges of ribs must not lose the ribs.
-    narrowest_mm = 1e3 * rack.min_rib_m
-    wider_mm = min(2e3 * size.openings_m, max(0.0, narrowest_mm - LEAST_RIB_MM))
-    outline = tuple(float(side) for side in np.array(rack.outline_mm) + 2e3 * size.outline_m)
-    try:
-        if rack.grid is not None:
-            slot = rack.grid.slot
-            grid = SlotGrid(
-                rows=rack.grid.rows, columns=rack.grid.columns,
-                pitch_mm=_pair(np.array(rack.grid.pitch_mm) * stretch),
-                slot=SlotShape(
-                    shape=slot.shape, size_mm=_pair(np.array(slot.size_mm) + wider_mm),
-                    corner_radius_mm=slot.corner_radius_mm,
-                ),
-                offset_mm=_pair(np.array(rack.grid.offset_mm) * stretch),
-            )  # fmt: skip
-            return RackModel(**{**rack.model_dump(), "outline_mm": outline, "grid": grid.model_dump()})
-        slots = [
-            {
-                **slot.model_dump(),
-                "center_mm": _pair(np.array(slot.center_mm) * stretch),
-                "size_mm": _pair(np.array(slot.size_mm) + wider_mm),
-            }
-            for slot in rack.slots
-        ]
-        return RackModel(**{**rack.model_dump(), "outline_mm": outline, "slots": slots})
-    except ValueError:
-        return None
-
-
-def _pair(values: FloatArray) -> tuple[float, float]:
-    return float(values[0]), float(values[1])
-
-
-def _upright(
-    points_m: FloatArray, rack: RackModel, found: Registration, config: Config
-) -> tuple[RackModel, Registration]:
-    """The same with the longer side along x, as racks are named: rows A, B, ... of many columns."""
-    if rack.grid is None or rack.outline_mm[0] >= rack.outline_mm[1]:
-        return rack, found
-    grid = rack.grid
-    slot = SlotShape(shape=grid.slot.shape, size_mm=grid.slot.size_mm[::-1])
-    turned = SlotGrid(rows=grid.columns, columns=grid.rows, pitch_mm=grid.pitch_mm[::-1], slot=slot)
-    name = f"grid-{turned.rows}x{turned.columns}"
-    keys = {**rack.model_dump(), "name": name, "outline_mm": rack.outline_mm[::-1], "grid": turned.model_dump()}
-    other = RackModel(**keys)
-    again = register_at(points_m, found.fit.T_camera_rack @ QUARTER_TURN, other, config.rack)
-    return (other, again) if again.size is not None else (rack, found)
 
 
 def _described(
@@ -245,7 +125,9 @@ def _described(
     depth = None if found.floor_m is None else (rack.height_mm - 1e3 * found.floor_m[0], 1e3 * found.floor_m[1])
     if depth is not None:
         nominal = float("nan") if like is None else like.height_mm - like.floor_mm
-        sizes.append(MeasuredSize("slot_depth_mm", depth[0], float(np.hypot(depth[1], face_mm)), nominal))
+        sizes.append(
+            MeasuredSize("slot_depth_mm", depth[0], float(np.linalg.norm([depth[1], face_mm, DEPTH_STD_MM])), nominal)
+        )
     elif like is not None:
         depth = (like.height_mm - like.floor_mm, like.floor_tolerance_mm)
     local = transform_points(invert_transform(T_camera_rack), points_m)
@@ -279,9 +161,8 @@ def _face_sizes(
             yield MeasuredSize(f"pitch_{name}_mm", step_mm * (1 + share), step_mm * share_std, told)
     outline = np.array(rack.outline_mm) + 2e3 * found.size.outline_m
     slot, kept = rack.all_slots[0], None if like is None else like.all_slots[0]
-    # Blur moves the edges of openings and outline alike: a known outline tells by how much.
-    blur_mm = 0.0 if like is None else float(np.mean(outline - like.outline_mm))
-    spread_mm = 2e3 * (float(std[2]) if like is None else found.size.wider_openings_m()[1])
+    blur_mm, blur_std_mm = _blur(outline, std, like)
+    spread_mm = float(np.hypot(2e3 * std[2], blur_std_mm))
     for axis, name in enumerate("xy" if slot.shape == "square" else "x"):
         value = slot.size_mm[axis] + 2e3 * found.size.openings_m + OPENING_SHIFT_MM + blur_mm
         quantity = f"opening_{name}_mm" if slot.shape == "square" else "opening_mm"
@@ -291,6 +172,18 @@ def _face_sizes(
         told = float("nan") if like is None else like.outline_mm[axis]
         spread = float(np.hypot(2e3 * std[3 + axis], OUTLINE_STD_MM))
         yield MeasuredSize(f"outline_{name}_mm", float(outline[axis]), spread, told)
+
+
+def _blur(outline_mm: FloatArray, std_m: FloatArray, like: RackModel | None) -> tuple[float, float]:
+    """By how much blur, or a loss of edges, makes a face larger, and its standard deviation, millimetres.
+
+    It moves the edges of openings and outline alike, so that a known outline tells it, where it is significant.
+    """
+    if like is None:
+        return 0.0, 0.0
+    off = float(np.mean(outline_mm - like.outline_mm))
+    std = float(np.linalg.norm(np.hypot(2e3 * std_m[3:5], OUTLINE_STD_MM))) / 2
+    return (off, std) if abs(off) > BLUR_SIGMAS * std else (0.0, 0.0)
 
 
 def _stretch(size: FaceSize, ribs: RibStretch, axis: int) -> tuple[float, float]:

@@ -29,7 +29,6 @@ from tubepose.profile.tops import top_radius_m
 from tubepose.profile.verdict import p_type, tube_checks
 from tubepose.sensor import SensorNoise, prior_noise
 from tubepose.sensor.caps import CapDisc, seen_on_caps
-from tubepose.sensor.noise import PRIOR, RACK_TOP
 from tubepose.transforms import FloatArray, axis_rotations, transform_points
 from tubepose.tube import TopMeasure, TubePose, TubeStatus
 
@@ -126,8 +125,8 @@ def fit_frame(
         rack_covariance: Of the rack's pose, shape (6, 6), as `RackPose.covariance`; None counts as exact.
         allowed: Which type may stand in which slot, shape (K, S), where a detector says; all by default.
         bow: Of the rack's face; None counts as flat.
-        noise: Of the sensor, as `measure_noise` has it; None takes the prior of section sensor. Where no table
-            told it, the caps of the frame are asked too.
+        noise: Of the sensor, as `measure_noise` has it; None takes the prior of section sensor. The caps of the
+            frame are asked too.
 
     Returns:
         Tubes by slot, then what is left over; without types, all that stands there is.
@@ -150,8 +149,7 @@ def fit_frame(
             may, T = None if allowed is None else allowed[:, local.rows], T_camera_rack @ local.T_rack_local
             measured = measure_tops(frame, intrinsics, T, local.rack, tubes, config, may)
             parts.append(_Part(T, local.rack, local.covariance, measured, local))
-    if noise.source in (RACK_TOP, PRIOR):
-        noise = seen_on_caps(noise, [disc for part in parts for disc in _cap_discs(part, tubes)])
+    noise = seen_on_caps(noise, [disc for part in parts for disc in _cap_discs(part, tubes)])
     found = [tube for part in parts for tube in _fit_part(part, tubes, noise, config.profile)]
     known, unknown_things = ([tube for tube in found if (tube.tube is None) is none] for none in (False, True))
     return ProfileFit((*known, *unknown_things), noise)

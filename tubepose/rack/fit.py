@@ -179,12 +179,12 @@ def refine(state: RoughFit, rack: RackModel) -> Fit:
     The first of them fits a bow. Where that is not significant, the face is flat. Tops that hold a rack tell its bow,
     too.
     """
-    top, fine = top_field(rack), _thinned(state.kept_m, FINE_POINTS)
+    top, fine, bowed = top_field(rack), _thinned(state.kept_m, FINE_POINTS), False
     if state.stray <= HOPELESS_SHARE:
-        bowed = False
         if state.level is None:
             flat = replace(state)
             _step(fine, state, top, ROUNDS_M[ROUGH_ROUNDS][0], BOW_WIDTHS_M, tells=True, bowed=True)
+            state.bow_covariance = state.bow_covariance * _lifted(state, fine, top)
             bowed = _significant(state.bow_m, state.bow_covariance)
             if not bowed:
                 flat.bow_covariance = state.bow_covariance
@@ -192,6 +192,8 @@ def refine(state: RoughFit, rack: RackModel) -> Fit:
         for number, (blur_m, widths_m) in enumerate(ROUNDS_M[ROUGH_ROUNDS:], ROUGH_ROUNDS):
             _step(fine, state, top, blur_m, widths_m, tells=number == len(ROUNDS_M) - 1, bowed=bowed)
     covariance = _covariance(state, fine, top)
+    if bowed:
+        state.bow_covariance = state.bow_covariance * _lifted(state, fine, top)
     bow_std_m = np.sqrt(np.diag(state.bow_covariance))
     return Fit(rack_frame(state, rack), covariance, state.scatter_m, state.level, state.bow_m, bow_std_m)
 
@@ -206,11 +208,7 @@ def _covariance(state: RoughFit, points_m: FloatArray, field: TopField) -> Float
     inflate = INFLATE if state.level is None else INFLATE_HELD
     covariance = np.asarray(inflate @ state.covariance @ inflate + np.diag(FLOOR**2))
     if state.level is None:
-        local = _flat_local(points_m, state)
-        distance, _, known = field.look_up(local)
-        off_m = np.abs(local[known & (distance < -INSIDE_M), 2])
-        lifted = float(np.mean(off_m > LIFTED_M)) if len(off_m) else 1.0
-        covariance[PLANE] *= 1 + (lifted / LIFTED_SHARE) ** 2
+        covariance[PLANE] *= _lifted(state, points_m, field)
         return covariance
     covariance[5, 5] += FLOOR_HELD_M**2
     # The height is that of ribs that may be seen at one end only: the level's error moves it at the centre.
@@ -219,6 +217,15 @@ def _covariance(state: RoughFit, points_m: FloatArray, field: TopField) -> Float
     lever = np.array([[1.0, 0], [0, 1], [-y, x]])
     covariance[PLANE] += lever @ state.level.covariance @ lever.T
     return covariance
+
+
+def _lifted(state: RoughFit, points_m: FloatArray, field: TopField) -> float:
+    """How many times larger variances of heights are because light lifts or sinks points of the solid part."""
+    local = _flat_local(points_m, state)
+    distance, _, known = field.look_up(local)
+    off_m = np.abs(local[known & (distance < -INSIDE_M), 2])
+    lifted = float(np.mean(off_m > LIFTED_M)) if len(off_m) else 1.0
+    return 1 + (lifted / LIFTED_SHARE) ** 2
 
 
 def leveled(rough: RoughFit, level: Level) -> RoughFit:

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from tubepose.sensor.noise import CAPS, PRIOR, RACK_TOP, SensorNoise, slope_gain
+from tubepose.sensor.noise import CAPS, PRIOR, TABLE, SensorNoise, slope_gain
 from tubepose.transforms import FloatArray
 
 CELLS = 4
@@ -105,18 +105,28 @@ class CapsError:
 def seen_on_caps(noise: SensorNoise, discs: Sequence[CapDisc]) -> SensorNoise:
     """The caps' noise where it is surely smaller than that of the rack's top, which stray light makes an upper bound.
 
-    Where no surface was seen at all, the caps' noise takes the place of what is assumed.
+    A table may be darker than the caps, and its depth noisier: where the points of caps lie surely nearer to their own
+    planes than the table's noise has them, all of it is scaled by that. Where no surface was seen at all, the caps'
+    noise takes the place of what is assumed.
 
     Args:
-        noise: Of the rack's top, or the prior; a table's is returned as it is.
+        noise: Of the table, of the rack's top, or the prior.
         discs: Flat tops of caps of the same frame.
 
     Returns:
         The smaller of the two, at the same reference distance; `source` says which.
     """
-    error = caps_error(discs, noise.distance_m) if noise.source in (RACK_TOP, PRIOR) else None
+    error = caps_error(discs, noise.distance_m)
     if error is None:
         return noise
+    if noise.source == TABLE:
+        radius_m = float(np.median([disc.radius_m * noise.distance_m / disc.depth_m for disc in discs]))
+        (std_m, known), (told_m, told_known) = residual_std(error, radius_m), residual_std(noise, radius_m)
+        share = std_m / told_m
+        if not share * (1 + SURE * float(np.hypot(known, told_known))) < 1:
+            return noise
+        words = f"the table has {1 / share:.1f} times the noise of the caps' points; all of it is scaled"
+        return replace(noise.scaled(share), note=words)
     caps = replace(
         noise,
         independent_m=error.independent_m,
@@ -138,6 +148,25 @@ def seen_on_caps(noise: SensorNoise, discs: Sequence[CapDisc]) -> SensorNoise:
         return noise
     words = f"the rack's top has {there / here:.1f} times the slope noise of the caps, whose noise is taken"
     return replace(caps, note=words)
+
+
+def residual_std(error: SensorNoise | CapsError, radius_m: float) -> tuple[float, float]:
+    """Standard deviation of points of a disc off its own plane, metres, and how well it is known, as a share of it.
+
+    A plane absorbs q^2 / (1 + q^2) of the variance of what points share by its height and 2 G(q) by its slopes, q their
+    correlation length over the radius, G `slope_gain`: 0.83 at q = 1.
+
+    Args:
+        error: Of the points.
+        radius_m: Radius of the disc, metres.
+    """
+    q = error.correlation_m / radius_m
+    left = max(1 - q**2 / (1 + q**2) - 2 * float(slope_gain(q)), 0.0)
+    own, shared = error.independent_m**2, error.shared_m**2 * left
+    shared_std = error.shared_relative_std if isinstance(error, SensorNoise) else error.relative_std
+    # Of a standard deviation's two parts, each known to its share.
+    known = np.hypot(own * error.independent_relative_std, shared * shared_std) / (own + shared)
+    return float(np.sqrt(own + shared)), float(known)
 
 
 def caps_error(discs: Sequence[CapDisc], distance_m: float) -> CapsError | None:

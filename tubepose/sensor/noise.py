@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -79,6 +79,14 @@ class SensorNoise:
     def depth_std_m(self) -> float:
         """Standard deviation of one point's depth, its own error and the shared one, metres."""
         return float(np.hypot(self.independent_m, self.shared_m))
+
+    def scaled(self, share: float) -> SensorNoise:
+        """The same noise, all errors of depth so many times as large."""
+        discs = tuple(
+            replace(disc, slope_std=share * disc.slope_std, height_std_m=share * disc.height_std_m)
+            for disc in self.discs
+        )
+        return replace(self, independent_m=share * self.independent_m, shared_m=share * self.shared_m, discs=discs)
 
     def slope_std(self, radius_m: float, distance_m: float) -> float:
         """Standard deviation of each slope of a least-squares plane through a disc of points.

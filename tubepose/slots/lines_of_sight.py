@@ -39,7 +39,8 @@ class FollowedLines:
         kinds: Share of every opening cell's lines per kind (`sight_kernels`), shape (C, 6); zeros without a line.
         passing: Share of every grid place's lines that ended at the face or below it, shape (X, Y): on a rib, in a slot
             as an empty one returns it, on the table.
-        covered: Which opening cells have points above the face, seen along the rack's normal, shape (C,).
+        highest_m: Height of the highest point above the face over each opening cell, seen along the rack's normal,
+            shape (C,), metres; NaN without one.
         in_image: Which opening cells lie inside the image, shape (C,); all of a cloud without pixels.
     """
 
@@ -47,7 +48,7 @@ class FollowedLines:
     cells: OpeningCells
     kinds: FloatArray
     passing: FloatArray
-    covered: NDArray[np.bool_]
+    highest_m: FloatArray
     in_image: NDArray[np.bool_]
 
 
@@ -93,7 +94,7 @@ def follow_sight(
     empty_m[cells.cell >= 0] = empty_height_m(cells, rack, camera_m)
     band_m = (BOW_M if bow_m is None else FACE_M) + 3 * depth_std_m
     heights = Heights(rack.height_m, band_m, band_m + 2e-3 * rack.floor_tolerance_mm)
-    counts, covered = follow_lines(
+    counts, highest_m = follow_lines(
         pixels, rotation, camera_m, heights, cells.low_m, cells.cell_m, cells.owner, empty_m
     )  # fmt: skip
     number = np.maximum(counts @ np.ones(KINDS), 1)
@@ -102,7 +103,7 @@ def follow_sight(
     in_image = np.ones(len(cells.slot), bool)
     if intrinsics is not None:
         in_image = _inside_image(cells, rack, intrinsics, T_camera_rack)
-    return FollowedLines(camera_m, cells, kinds, counts[..., PASSED] / number, covered[openings], in_image)
+    return FollowedLines(camera_m, cells, kinds, counts[..., PASSED] / number, highest_m[openings], in_image)
 
 
 def _cell_m(spacing_m: float) -> float:

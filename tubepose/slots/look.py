@@ -24,6 +24,9 @@ PATCH_M = 3.0e-3
 """Side of a patch of lines of sight that count as one, metres: neighbours share their error, an edge, a ghost. The
 range over which real scanners' depth errors were measured to be shared."""
 
+LEVEL_M = 4.0e-3
+"""Heights of one top, metres: caps lean by 10 deg at most, a millimetre over a slot's middle; edges are rounded."""
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SlotLook:
@@ -39,7 +42,8 @@ class SlotLook:
         hidden: Share whose lines were stopped above the face elsewhere: by what stands in another slot.
         silent: Share inside the image from which nothing came back: a black cap or a dark well. Of a cloud without
             pixels, all that no line of sight is known of.
-        covered: Share of the slot's middle that is covered by points above the face, seen along the rack's normal.
+        covered: Share of the slot's middle that is covered by points above the face at one height, seen along the
+            rack's normal.
         seen_share: Share that was looked at: lines that went in or met the slot's own content, or `covered` if larger.
         patches_passed: Patches of 3 x 3 mm whose lines went on where a tube in the slot would have stopped them
             (`contradicting_m2`): lines into the opening, and those through the column above it that ended behind it.
@@ -110,7 +114,7 @@ def look_at_slots(
     # Inside the image, a cell without a line of sight is silent, too.
     shares[:, SILENT] = np.maximum(in_image - shares[:, :SILENT].sum(axis=1), 0.0)
     core = core_cells(cells, rack, tubes)
-    covered = per_slot(core & lines.covered)
+    covered = covered_cells(lines.highest_m, core, cells.slot, n_slots)
     stops = kinds[:, STANDING] + kinds[:, FILLED]
     stopped = per_slot(telling_cells(cells, rack, tubes, lines.camera_m) * stops)
     passed_m2 = contradicting_m2(lines.passing, cells, rack, tubes, lines.camera_m)
@@ -120,3 +124,25 @@ def look_at_slots(
     seen = np.maximum(shares[:, [PASSED, STANDING, FILLED, AT_FACE]].sum(axis=1), covered)
     table = np.column_stack([in_image, shares, covered, seen, *patches]).tolist()
     return tuple(SlotLook(slot.name, *row) for slot, row in zip(rack.all_slots, table, strict=True))
+
+
+def covered_cells(
+    highest_m: FloatArray, core: NDArray[np.bool_], slot: NDArray[np.intp], n_slots: int
+) -> NDArray[np.float64]:
+    """How many cells of every slot's middle are covered at one height, shape (S,): the fullest `LEVEL_M` counts.
+
+    What stands in a slot has a top there. Light that clear walls bend leaves points at all heights.
+
+    Args:
+        highest_m: Height of the highest point over each opening cell, shape (C,), metres; NaN without one.
+        core: Which cells are of a slot's middle, shape (C,).
+        slot: Index of every cell's slot, shape (C,).
+        n_slots: How many slots there are.
+    """
+    rows = np.flatnonzero(core & np.isfinite(highest_m))
+    if len(rows) == 0:
+        return np.zeros(n_slots)
+    level = np.floor((highest_m[rows] - highest_m[rows].min()) / (LEVEL_M / 2)).astype(np.intp)
+    width = int(level.max()) + 2
+    counts = np.bincount(slot[rows] * width + level, minlength=n_slots * width).reshape(n_slots, width)
+    return np.asarray((counts[:, :-1] + counts[:, 1:]).max(axis=1), float)

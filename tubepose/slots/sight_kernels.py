@@ -92,10 +92,11 @@ def follow_lines(pixels, rotation, camera_m, heights, low_m, cell_m, owner, empt
 
     Returns:
         Number of lines per place and kind, shape (X, Y, 6), where those that cross no opening have passed (they ended
-        at the face or below), are hidden or silent; and which places have points above the face, shape (X, Y).
+        at the face or below), are hidden or silent; and the height of the highest point above the face at each place,
+        shape (X, Y), metres, NaN without one.
     """
     counts = np.zeros((*owner.shape, KINDS))
-    covered = np.zeros(owner.shape, np.bool_)
+    highest = np.full(owner.shape, np.nan)
     fx, fy, cx, cy = pixels.camera_px
     for i in range(0, pixels.cloud_m.shape[0], pixels.step):
         for j in range(0, pixels.cloud_m.shape[1], pixels.step):
@@ -112,8 +113,8 @@ def follow_lines(pixels, rotation, camera_m, heights, low_m, cell_m, owner, empt
             if returned:
                 end = camera_m[2] + up
                 end_x, end_y = place_of(camera_m[0] + right, camera_m[1] + ahead, low_m, cell_m, owner.shape)
-                if end > heights.face + heights.band and end_x >= 0:
-                    covered[end_x, end_y] = True
+                if end > heights.face + heights.band and end_x >= 0 and not end <= highest[end_x, end_y]:
+                    highest[end_x, end_y] = end
             # A line that goes up crosses nothing.
             if up < 0:
                 along = (heights.face - camera_m[2]) / up
@@ -124,7 +125,7 @@ def follow_lines(pixels, rotation, camera_m, heights, low_m, cell_m, owner, empt
                     empty = empty_m[at_x, at_y]
                     own = end_x >= 0 and owner[end_x, end_y] == owner[at_x, at_y] and not math.isnan(empty)
                     counts[at_x, at_y, kind_of(end, own, empty, heights)] += 1
-    return counts, covered
+    return counts, highest
 
 
 @compiled
