@@ -58,6 +58,9 @@ fi
 echo "setup: installing the Python packages into .venv (about 1.5 GB; some minutes)"
 .venv/bin/python -m pip install --quiet --upgrade --editable ".[dev]" ||
     fail "pip could not install the dependencies; see its message above"
+# Programs whose recordings the tests read; the tests are skipped where there is no wheel of them.
+.venv/bin/python -m pip install --quiet --upgrade --editable ".[writers]" ||
+    echo "setup: no RealSense or Foxglove SDK for this Python; the tests of their own recordings are skipped" >&2
 .venv/bin/python -c 'import cv2, onnxruntime, open3d, tubepose, tubepose_cli' ||
     fail "the environment does not import; install the library that is named above"
 touch .venv/.ready

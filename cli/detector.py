@@ -94,7 +94,8 @@ def train(
     images: Annotated[
         list[Path] | None,
         typer.Option(
-            help="Learn from this set (images/, labels/, classes.txt) and render none; several: give it again."
+            help="Learn from this set (images/, labels/, classes.txt; a data.yaml) and render none; "
+            "several: give it again."
         ),
     ] = None,
     start: Annotated[
@@ -180,9 +181,9 @@ def evaluate(
     import cv2
     import pandas as pd
 
-    from tubepose.detection.box_files import read_class_names
     from tubepose.detection.bundled import bundled_model
     from tubepose.detection.evaluation import evaluate_detector, kinds_of
+    from tubepose.detection.label_formats import read_class_names
     from tubepose.detection.labelled_images import find_labelled
     from tubepose.detection.yolo import YoloDetector
     from tubepose.report import write_aside, write_csv
@@ -259,6 +260,7 @@ def read_labware_list(names: str) -> Stock:
     """Racks, tubes and printed caps of a comma-separated list of names and files, or of the whole catalogue."""
     from tubepose.errors import LabwareError
     from tubepose.labware import CapModel, RackModel, TubeModel, catalogue, read_labware
+    from tubepose.labware.reading import LABWARE_SUFFIXES
     from tubepose.training.scenes import Stock
     from tubepose_cli.inputs import unknown_name
 
@@ -269,10 +271,10 @@ def read_labware_list(names: str) -> Stock:
             found += known.values()
         elif name in known:
             found.append(known[name])
-        elif Path(name).suffix in (".yaml", ".yml"):
+        elif Path(name).suffix in LABWARE_SUFFIXES:
             found.append(read_labware(Path(name)))
         elif name:
-            raise LabwareError(unknown_name("labware", name, known) + "; or give a .yaml file")
+            raise LabwareError(unknown_name("labware", name, known) + "; or give a .yaml or .json file")
     racks = tuple(item for item in found if isinstance(item, RackModel))
     tubes = tuple(item for item in found if isinstance(item, TubeModel))
     caps = tuple(item for item in found if isinstance(item, CapModel))

@@ -26,7 +26,8 @@ def estimate(
         typer.Argument(
             parser=named,
             metavar="CAPTURES",
-            help="Capture folders, .ply or .mcap files, session folders, or folders of those.",
+            help="Capture folders, .ply, .pcd, .ptx, .mcap, .db3 or .bag files, BOP scenes, session folders, or "
+            "folders of those.",
         ),
     ],
     out: Annotated[
@@ -64,10 +65,22 @@ def estimate(
             help="Unit of the clouds, m or mm; goes before capture.yaml. A bare .ply file is in m without it."
         ),
     ] = None,
-    cloud_topic: Annotated[str | None, typer.Option(help="Topic of the clouds in an .mcap file.")] = None,
-    depth_topic: Annotated[str | None, typer.Option(help="Topic of the depth images in an .mcap file.")] = None,
-    image_topic: Annotated[str | None, typer.Option(help="Topic of the images in an .mcap file.")] = None,
-    info_topic: Annotated[str | None, typer.Option(help="Topic of the CameraInfo in an .mcap file.")] = None,
+    depth_scale: Annotated[
+        float | None,
+        typer.Option(
+            metavar="METRES",
+            help="Metres of one count of depth images: 0.001 for millimetres, 1 for floats in metres; goes before "
+            "what files say.",
+        ),
+    ] = None,
+    cloud_topic: Annotated[str | None, typer.Option(help="Topic of the point clouds in a recording.")] = None,
+    depth_topic: Annotated[str | None, typer.Option(help="Topic of the depth images in a recording.")] = None,
+    image_topic: Annotated[str | None, typer.Option(help="Topic of the images in a recording.")] = None,
+    info_topic: Annotated[str | None, typer.Option(help="Topic of the CameraInfo in a recording.")] = None,
+    max_stamp_difference: Annotated[
+        float | None,
+        typer.Option(metavar="MS", help="Stamps of picture and cloud in a recording differ by no more; default: 50."),
+    ] = None,
     hint: Annotated[
         list[str] | None,
         typer.Option(
@@ -106,6 +119,7 @@ def estimate(
         no_such_file,
         read_methods,
         read_tubes,
+        refuse_idle_scale,
         refuse_idle_topics,
         refuse_twins,
         sessions_below,
@@ -136,6 +150,8 @@ def estimate(
                 tube_models,
                 settings,
                 unit=unit,
+                depth_scale_m=depth_scale,
+                max_stamp_difference_ms=max_stamp_difference,
                 hints=told,
                 topics=topics,
                 average=fused,
@@ -148,7 +164,8 @@ def estimate(
             problems += [*unread, *twins]
     if not jobs:
         finish(problems)  # before anything of an earlier run is written over
-    refuse_idle_topics(jobs, topics)
+    refuse_idle_topics(jobs, {**topics, "max-stamp-difference": max_stamp_difference})
+    refuse_idle_scale(jobs, depth_scale)
     with kept(problems if problems and not fail_fast else None):
         refuse_unknown_captures(jobs, told)
     tables = run_estimates(
@@ -160,6 +177,7 @@ def estimate(
         problems=problems, detector=detector, averaged=average is not None,
     )  # fmt: skip
     _tell(tables, several=len(methods) > 1)
+    _tell_notes(tables)
     if tubes is None and any(not job.tubes for job in jobs):
         say("no --tubes given: only the rack and its slots are estimated")
     finish([*problems, *tables.problems, *(_ambiguous(tables) if require_unambiguous else [])])
@@ -216,6 +234,20 @@ def _tell(tables: Tables, *, several: bool) -> None:
             say(f"{row['capture']} frame {row['frame']}: rack {row['rack']} {_rack_words(row, tables)}; {by}{found}")
         elif _capture_of(row) in with_rack:  # else its reason is among the problems
             say(f"{row['capture']} frame {row['frame']}: {row['status']}: {row['reason']}")
+
+
+def _tell_notes(tables: Tables) -> None:
+    """A line for each frame in which something was passed over or taken for granted; one for all that are alike."""
+    from tubepose_cli.show import say
+
+    frames: dict[tuple[str, str], dict[int, None]] = {}
+    for row in tables.racks:
+        if row["capture_note"]:
+            frames.setdefault((row["capture"], row["capture_note"]), {})[row["frame"]] = None
+    for (capture, note), numbers in frames.items():
+        first = next(iter(numbers))
+        more = f" and {len(numbers) - 1} more" if len(numbers) > 1 else ""
+        say(f"{capture} frame {first}{more}: note: {note}")
 
 
 def _rack_words(row: Row, tables: Tables) -> str:

@@ -106,6 +106,8 @@ def capture_jobs(
     config: Config,
     *,
     unit: str | None = None,
+    depth_scale_m: float | None = None,
+    max_stamp_difference_ms: float | None = None,
     hints: HintChoice | None = None,
     topics: Mapping[str, str | None] | None = None,
     average: Average = 1,
@@ -122,12 +124,14 @@ def capture_jobs(
     from tubepose_cli.racks import rack_finder
 
     if path.name == SESSION_FILE or (path.is_dir() and is_session(path)):
-        given = {"--unit": unit} | {f"--{kind}-topic": name for kind, name in (topics or {}).items()}
+        given: dict[str, object] = {"--unit": unit, "--depth-scale": depth_scale_m}
+        given["--max-stamp-difference"] = max_stamp_difference_ms
+        given |= {f"--{kind}-topic": name for kind, name in (topics or {}).items()}
         idle = [option for option, value in given.items() if value is not None] + (hints.options if hints else [])
         if idle:
             raise ConfigError(
-                f"{path}: {', '.join(idle)} given, but a session says that itself: unit, topics, and a trial's hint; "
-                "leave it out, or give the captures one by one"
+                f"{path}: {', '.join(idle)} given, but a session says that itself: unit, depth_scale_m, "
+                "max_stamp_difference_ms, topics, and a trial's hint; leave it out, or give the captures one by one"
             )
         known, problems = session_jobs(load_session(path, average), fail_fast=fail_fast)
         if choice.open:
@@ -142,7 +146,14 @@ def capture_jobs(
     if not path.exists():
         raise CaptureError(no_such_file(path))
     topic = {f"{kind}_topic": name for kind, name in (topics or {}).items()}
-    opened = open_captures(path, unit=unit, average=average, **topic)
+    opened = open_captures(
+        path,
+        unit=unit,
+        depth_scale_m=depth_scale_m,
+        max_stamp_difference_ms=max_stamp_difference_ms,
+        average=average,
+        **topic,
+    )
     told = [(capture, *(hints.of(capture.name) if hints else (None, False))) for capture in opened]
     if choice.rack is not None:
         rack = choice.rack
@@ -181,17 +192,33 @@ def refuse_twins(
     return kept, problems
 
 
-def refuse_idle_topics(jobs: Sequence[Job | UnnamedJob], topics: Mapping[str, str | None]) -> None:
-    """Topics are of recordings.
+def refuse_idle_topics(jobs: Sequence[Job | UnnamedJob], topics: Mapping[str, object]) -> None:
+    """Topics and stamps are of recordings.
 
     Raises:
-        ConfigError: One is named, and no capture is a recording.
+        ConfigError: One is given, and no capture is a recording.
     """
+    from tubepose.capture.formats.containers import SUFFIXES, is_recording
     from tubepose.errors import ConfigError
 
-    idle = [f"--{kind}-topic" for kind, name in topics.items() if name is not None]
-    if idle and not any(job.capture.path.suffix.lower() == ".mcap" for job in jobs):
-        raise ConfigError(f"{', '.join(idle)} given, but no .mcap file is there that has topics; leave it out")
+    idle = [f"--{kind}{'' if '-' in kind else '-topic'}" for kind, name in topics.items() if name is not None]
+    if idle and not any(is_recording(job.capture.path) for job in jobs):
+        raise ConfigError(
+            f"{', '.join(idle)} given, but no recording ({', '.join(SUFFIXES)}) is there that has topics; leave it out"
+        )
+
+
+def refuse_idle_scale(jobs: Sequence[Job | UnnamedJob], depth_scale_m: float | None) -> None:
+    """A scale is of depth images.
+
+    Raises:
+        ConfigError: One is given, and every capture is a cloud in a file.
+    """
+    from tubepose.capture.formats.cloud_files import CLOUD_READERS
+    from tubepose.errors import ConfigError
+
+    if depth_scale_m is not None and all(job.capture.path.suffix.lower() in CLOUD_READERS for job in jobs):
+        raise ConfigError("--depth-scale given, but no depth image is there; a cloud's unit is --unit; leave it out")
 
 
 def used_model(detector: str, model: Path | None) -> Path | None:
@@ -217,9 +244,9 @@ def make_detector(
         return lambda rack, tubes: GeometricDetector(rack, tubes, config)
     if name == "yolo":
         from tubepose.detection.assisted import AssistedDetector
-        from tubepose.detection.box_files import read_class_names
         from tubepose.detection.bundled import bundled_model
         from tubepose.detection.geometric import GeometricDetector
+        from tubepose.detection.label_formats import read_class_names
         from tubepose.detection.yolo import YoloDetector
 
         names = read_class_names(classes) if classes is not None else None

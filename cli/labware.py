@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 
     from tubepose.labware import CapModel, Labware, RackModel, TubeModel
 
-app = typer.Typer(no_args_is_help=True, help="Racks, tubes and printed caps: list, show and check definitions.")
+app = typer.Typer(no_args_is_help=True, help="Racks, tubes and printed caps: list, show, check and measure them.")
 
 
 @app.command("list")
@@ -28,7 +28,7 @@ def list_labware() -> None:
         table.add_column(heading, no_wrap=heading != "description", overflow="fold")
     for item in sorted(catalogue().values(), key=lambda item: (_ORDER[item.kind], item.name)):
         table.add_row(item.kind, item.name, item.description)
-    _print(table)
+    print_table(table)
 
 
 @app.command()
@@ -45,7 +45,7 @@ def show(
     table.add_column(overflow="fold")
     for word, value in (("name", f"{item.name} ({item.kind})"), *_describe(item)):
         table.add_row(word, value)
-    _print(table)
+    print_table(table)
     if out is not None:
         _draw(item, out)
 
@@ -77,18 +77,22 @@ def _find(name_or_file: str) -> Labware:
 
     from tubepose.errors import LabwareError
     from tubepose.labware import catalogue, read_labware
+    from tubepose.labware.reading import LABWARE_SUFFIXES
 
     known = catalogue()
     if name_or_file in known:
         return known[name_or_file]
-    if Path(name_or_file).suffix in (".yaml", ".yml"):
+    if Path(name_or_file).suffix in LABWARE_SUFFIXES:
         return read_labware(Path(name_or_file))
     close = difflib.get_close_matches(name_or_file, known, n=1)
     guess = f"; did you mean '{close[0]}'?" if close else ";"
-    raise LabwareError(f"unknown labware '{name_or_file}'{guess} see 'tubepose labware list', or give a .yaml file")
+    raise LabwareError(
+        f"unknown labware '{name_or_file}'{guess} see 'tubepose labware list', or give a .yaml or .json file"
+    )
 
 
-def _print(table: Table) -> None:
+def print_table(table: Table) -> None:
+    """Show a table on stdout, its lines whole where that is no terminal."""
     from rich.console import Console
 
     # Into a pipe or file go whole lines.

@@ -13,6 +13,7 @@ from tubepose_cli import data, detector, labware
 from tubepose_cli.bench import bench
 from tubepose_cli.estimate import estimate
 from tubepose_cli.gt import gt
+from tubepose_cli.measure import measure
 from tubepose_cli.sensor import sensor
 from tubepose_cli.simulate import simulate
 
@@ -25,6 +26,7 @@ app = typer.Typer(
 )
 for _command in (estimate, gt, bench, simulate, sensor):
     app.command()(_command)
+labware.app.command()(measure)
 app.add_typer(labware.app, name="labware")
 app.add_typer(data.app, name="data")
 app.add_typer(detector.app, name="detector")

@@ -21,7 +21,7 @@ ALLOWED: dict[str, set[str]] = {
     "errors": set(),
     "transforms": set(),
     "labware": set(),
-    "capture": {"labware"},
+    "capture": {"compiled", "labware"},
     "config": {"labware"},
     "preprocessing": {"config", "labware"},
     "rack_band": {"config", "labware", "preprocessing"},
@@ -67,6 +67,8 @@ ALLOWED: dict[str, set[str]] = {
     "stage_times": set(),
     "tubes_pitch": {"checks", "config", "labware", "rack", "scene", "statistics", "tube"},
     "labware_check": {"config", "labware", "rack", "scene", "statistics", "tubes_pitch"},
+    "standing_tops": {"labware"},
+    "labware_measure": {"capture", "config", "labware", "rack", "sensor", "standing_tops"},
     "result_tables": {"labware", "records"},
     "records": {
         "capture",

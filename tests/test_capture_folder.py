@@ -337,7 +337,7 @@ def test_cloud_that_is_not_pixel_to_pixel_is_projected(tmp_path):
         ({"unit": "m", "intrinsics": {**camera_keys(), "f": 1}}, "unknown key 'intrinsics.f'; known keys: width"),
         ({"unit": "m", "timestamp_ns": 1.7e18}, "timestamp_ns"),
         ({"unit": "mm", "depth_scale_m": 2e-5}, "one count of the depth image is 0.001 m, depth_scale_m says 2e-05"),
-        ({"unit": "m", "depth_scale_m": 1.0}, "depth_scale_m is in metres per count"),
+        ({"unit": "m", "depth_scale_m": 2.0}, "depth_scale_m is in metres per count"),
         ({"unit": "m", "cloud": "a.ply", "depth": "d.png"}, "'cloud' and 'depth' are both given"),
         ({"unit": "m", "cloud_width": 3}, "cloud_width and cloud_height belong together"),
         ({"unit": "m", "T_image_cloud": np.eye(4).tolist()}, "T_image_cloud needs 'intrinsics'"),
@@ -382,7 +382,7 @@ def test_intrinsics_of_another_size_are_refused(tmp_path):
 def test_picture_of_depth_and_cut_png_are_refused(tmp_path, capfd):
     describe(tmp_path / "shot", unit="mm", intrinsics=camera_keys())
     write_png(tmp_path / "shot" / "depth.png", np.zeros((24, 32, 3), np.uint8))
-    with pytest.raises(CaptureError, match="16 bits and 1 channel, found 8 bits and 3 channel"):
+    with pytest.raises(CaptureError, match=r"16 bits and 1 channel \(or of floats\), found 8 bits and 3 channel"):
         read_one(tmp_path / "shot")
     write_png(tmp_path / "shot" / "depth.png", np.ones((24, 32), np.uint16))
     whole = (tmp_path / "shot" / "depth.png").read_bytes()
@@ -441,7 +441,7 @@ def test_what_is_left_of_a_capture_is_told_of(tmp_path):
             list(captures[name].frames())
 
 
-@pytest.mark.parametrize("suffix", [".bag", ".zdf", ".praw", ".db3", ".ptx", ".pcd"])
+@pytest.mark.parametrize("suffix", [".zdf", ".praw"])
 def test_other_formats_say_how_to_convert(tmp_path, suffix):
     (tmp_path / f"scan{suffix}").write_bytes(b"")
     with pytest.raises(CaptureError, match=r"convert|save it as PLY"):
@@ -454,7 +454,7 @@ def test_nothing_to_open_is_said(tmp_path):
     with pytest.raises(CaptureError, match=r"no capture found; looked .* capture\.yaml, cloud\.ply or depth\.png"):
         open_captures(tmp_path)
     (tmp_path / "scan.xyz").write_text("1 2 3")
-    with pytest.raises(CaptureError, match=r"ending in \.ply or \.mcap, found '\.xyz'"):
+    with pytest.raises(CaptureError, match=r"ending in \.ply, \.pcd, \.ptx, \.mcap, \.db3, \.bag, found '\.xyz'"):
         open_captures(tmp_path / "scan.xyz")
     with pytest.raises(CaptureError, match="unit 'cm' is not known; expected m or mm"):
         open_captures(tmp_path, unit="cm")

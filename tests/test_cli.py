@@ -1044,7 +1044,7 @@ def test_a_path_that_is_not_there_writes_over_nothing(command: str, tmp_path: Pa
     ("options", "words"),
     [
         (("--tubes", ","), "--tubes ',' names no tube"),
-        (("--cloud-topic", "/points"), "--cloud-topic given, but no .mcap file is there"),
+        (("--cloud-topic", "/points"), "--cloud-topic given, but no recording"),
         (("--hint", "A1@nan,2"), "--hint A1@nan,2: expected SLOT@U,V"),
     ],
 )

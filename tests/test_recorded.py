@@ -141,7 +141,7 @@ def test_class_files_that_cannot_be_used(tmp_path):
     bare = tmp_path / "c" / "labels"
     bare.mkdir(parents=True)
     with pytest.raises(
-        DetectorError, match=r"no class names; expected .*classes.txt with one name a line, or give classes"
+        DetectorError, match=r"no class names; expected .*classes.txt with one name a line .*, or give classes"
     ):
         RecordedDetector(bare)
     with pytest.raises(DetectorError, match=r"none.txt: no such file"):

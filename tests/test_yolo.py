@@ -557,3 +557,59 @@ def test_importing_detection_does_not_load_onnxruntime():
 def test_end_to_end_metadata_of_an_export_without_that_head(tmp_path):
     path = constant_model(tmp_path / "m.onnx", TABLES["yolov8"], metadata=METADATA | {"end2end": "True"})
     assert YoloDetector(path).layout == "yolov8"
+
+
+# Transformers --------------------------------------------------------------------------------------------------------
+
+
+def named_model(path, names, shapes, *, sizes=False, metadata=None):
+    """A network with outputs of these names, and with a second input for the sizes of pictures."""
+    nodes = [helper.make_node("Identity", [f"table_{name}"], [name]) for name in names]
+    tables = [
+        numpy_helper.from_array(np.zeros(s, np.float32), f"table_{n}") for n, s in zip(names, shapes, strict=True)
+    ]
+    inputs = [helper.make_tensor_value_info("images", TensorProto.FLOAT, (1, 3, 64, 96))]
+    inputs += [helper.make_tensor_value_info("orig_target_sizes", TensorProto.INT64, (1, 2))] if sizes else []
+    outputs = [helper.make_tensor_value_info(name, TensorProto.FLOAT, None) for name in names]
+    model = helper.make_model(
+        helper.make_graph(nodes, "t", inputs, outputs, tables),
+        opset_imports=[helper.make_opsetid("", 17)],
+        ir_version=9,
+    )
+    helper.set_model_props(model, metadata or {})
+    onnx.save(model, str(path))
+    return path
+
+
+@pytest.mark.parametrize(
+    ("names", "shapes", "sizes", "word"),
+    [
+        (("labels", "boxes", "scores"), [(1, 300), (1, 300, 4), (1, 300)], True, "an RT-DETR or D-FINE"),
+        (("labels", "boxes", "scores"), [(1, 300), (1, 300, 4), (1, 300)], False, "an RT-DETR or D-FINE"),
+        (("logits", "pred_boxes"), [(1, 300, 2), (1, 300, 4)], False, "of the Transformers library"),
+        (("dets", "labels"), [(1, 300, 4), (1, 300, 3)], False, "an RF-DETR"),
+    ],
+)
+def test_transformers_are_told_by_the_names_of_their_outputs(tmp_path, names, shapes, sizes, word):
+    path = named_model(tmp_path / "m.onnx", names, shapes, sizes=sizes)
+    with pytest.raises(DetectorError, match=f"{word}.*which is not read; expected a YOLO model") as told:
+        YoloDetector(path, classes=("rack", "tube"))
+    assert "\n" not in str(told.value)
+
+
+@pytest.mark.parametrize("classes", [("rack", "tube"), NAMES])
+def test_an_rt_detr_of_ultralytics_is_told_by_its_metadata(tmp_path, classes):
+    metadata = METADATA | {"names": str(dict(enumerate(classes))), "description": "Ultralytics rtdetr-l model"}
+    path = constant_model(tmp_path / "m.onnx", np.zeros((1, 300, 4 + len(classes))), metadata=metadata)
+    with pytest.raises(DetectorError, match=r"a transformer \(rtdetr, by its metadata\)"):
+        YoloDetector(path)
+
+
+def test_queries_of_two_classes_are_not_taken_for_final_boxes(tmp_path):
+    """The shape is that of final boxes; the values are shares and scores."""
+    queries = np.random.default_rng(2).uniform(0.01, 0.99, (1, 300, 6))
+    with pytest.raises(DetectorError, match=r"an RT-DETR \(output \[1, 300, 6\] of shares"):
+        YoloDetector(constant_model(tmp_path / "m.onnx", queries), classes=("rack", "tube"))
+    for rows in ([FINAL_ROW], np.zeros((0, 6))):
+        path = constant_model(tmp_path / "f.onnx", final_table(rows, 300), metadata=METADATA)
+        assert YoloDetector(path).layout == "final"

@@ -21,7 +21,7 @@ from tubepose.labware import Labware, labware_sha256
 
 PACKAGES = (
     "numpy", "scipy", "numba", "llvmlite", "open3d", "open3d-cpu", "onnxruntime", "opencv-python-headless", "pandas",
-    "mcap", "kiss-matcher", "small_gicp",
+    "mcap", "rosbags", "kiss-matcher", "small_gicp",
 )  # fmt: skip
 
 

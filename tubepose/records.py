@@ -32,7 +32,8 @@ RACK_COLUMNS = (
     "session", "trial", "capture", "frame", "timestamp_ns", "method", "rack", "status", "reason", "reason_code",
     "marks", "ambiguous",
     "resolved_by", "hint_note", "turn_margin_m", "inlier_rmse_m", "fitness", "in_slot_share", "coverage", "spacing_m",
-    "level_tops", "n_racks_detected", "n_tubes_detected", "box_source", "box_score", "box_note", *POSE_COLUMNS,
+    "level_tops", "n_racks_detected", "n_tubes_detected", "box_source", "box_score", "box_note", "capture_note",
+    *POSE_COLUMNS,
     "named_by_nats", *BOW_COLUMNS, *RACK_COVARIANCE_COLUMNS,
 )  # fmt: skip
 SENSOR_COLUMNS = (
@@ -146,6 +147,7 @@ def rack_pose_row(frame: RgbdFrame, pose: RackPose) -> Row:
         "ambiguous": pose.ambiguous,
         "resolved_by": pose.resolved_by,
         "hint_note": pose.hint_note,
+        "capture_note": "; ".join(frame.notes),
         "turn_margin_m": pose.turn_margin_m,
         "inlier_rmse_m": pose.inlier_rmse_m,
         "fitness": pose.fitness,

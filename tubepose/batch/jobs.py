@@ -102,7 +102,10 @@ def trial_capture(session: Session, trial: Trial, relative: str) -> Capture:
     whole = Path(relative).with_suffix("" if place.is_file() else Path(relative).suffix).as_posix()
     name = whole if sum(Path(path).stem == Path(relative).stem for path in paths) > 1 else None
     topics = {f"{kind}_topic": topic for kind, topic in session.topics.model_dump().items()}
-    found = open_captures(place, name=name, unit=session.unit, average=session.average, **topics)
+    found = open_captures(
+        place, name=name, unit=session.unit, depth_scale_m=session.depth_scale_m,
+        max_stamp_difference_ms=session.max_stamp_difference_ms, average=session.average, **topics,
+    )  # fmt: skip
     if len(found) != 1:
         raise CaptureError(f"{place}: trial {trial.name} needs one capture, found {len(found)}")
     return found[0]

@@ -24,7 +24,6 @@ _FORMAT = re.compile(r"(16UC1|32FC1)\s*;\s*compressedDepth(?:\s+png)?\s*", re.IG
 # Kind of compression (0: inverse depth), A, B; little endian, as every computer that runs ROS writes it.
 _HEADER = struct.Struct("<iff")
 _MAX_COUNT = 65535
-_METRES_PER_COUNT = 1.0e-3
 
 
 def is_compressed_depth(form: str) -> bool:
@@ -59,13 +58,17 @@ def encode_compressed_depth(depth_m: FloatArray, where: str, step_m: float = DEP
     return _HEADER.pack(0, a, b) + encode_depth_png(counts)
 
 
-def decode_compressed_depth(form: str, data: bytes, where: str) -> FloatArray:
+def decode_compressed_depth(
+    form: str, data: bytes, where: str, metres_per_count: float = 1.0e-3, metres_per_number: float = 1.0
+) -> FloatArray:
     """Depth (H, W) in metres of a `compressedDepth` message; NaN for invalid pixels.
 
     Args:
         form: The message's format, for example ``16UC1; compressedDepth png``.
         data: The message's data.
         where: Start of error messages.
+        metres_per_count: Scale of depth of 16 bits.
+        metres_per_number: Scale of depth of 32 bits.
 
     Raises:
         CaptureError: A format that is not read, a header that is too short or makes no depth, or no whole PNG of depth.
@@ -81,11 +84,11 @@ def decode_compressed_depth(form: str, data: bytes, where: str) -> FloatArray:
             f"{where}: the compressed depth holds {len(data)} bytes, expected a header of {_HEADER.size} bytes and a "
             "PNG after it; record it again"
         )
-    counts = depth_counts(decode(data[_HEADER.size :], where), where)
+    counts = depth_counts(decode(data[_HEADER.size :], where), where).astype(np.uint16, copy=False)
     if known[1].upper() == "16UC1":
-        return depth_to_metres(counts, _METRES_PER_COUNT)
+        return depth_to_metres(counts, metres_per_count)
     _, a, b = _HEADER.unpack_from(data)
-    return _from_inverse(counts, a, b, where)
+    return metres_per_number * _from_inverse(counts, a, b, where)
 
 
 def _from_inverse(counts: NDArray[np.uint16], a: float, b: float, where: str) -> FloatArray:

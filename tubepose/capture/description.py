@@ -13,13 +13,20 @@ from tubepose.transforms import FloatArray
 CAPTURE_FILE = "capture.yaml"
 CLOUD_FILE = "cloud.ply"
 DEPTH_FILE = "depth.png"
+CLOUD_FILES = (CLOUD_FILE, "cloud.pcd", "cloud.ptx")
+DEPTH_FILES = (DEPTH_FILE, "depth.tiff", "depth.tif", "depth.exr", "depth.npy")
 IMAGE_FILES = ("image.png", "image.jpg", "image.jpeg")
 
 Unit = Literal["m", "mm"]
 _Row = tuple[float, float, float, float]
 _FORBID = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
-# Counts coarser than this are a scale given in the wrong unit.
+# Counts coarser than this are a scale given in the wrong unit; floats can be whole metres.
 _MAX_DEPTH_SCALE_M = 0.01
+
+
+def is_depth_scale(metres_per_count: float) -> bool:
+    """Whether a number can be the metres of one count: up to 0.01, or 1 for floats that are metres."""
+    return 0 < metres_per_count <= _MAX_DEPTH_SCALE_M or metres_per_count == 1
 
 
 class IntrinsicsEntry(BaseModel):
@@ -33,6 +40,12 @@ class IntrinsicsEntry(BaseModel):
     cx: float
     cy: float
 
+    @model_validator(mode="after")
+    def _check(self) -> IntrinsicsEntry:
+        if fault := self.camera().fault:
+            raise ValueError(fault)
+        return self
+
     def camera(self) -> CameraIntrinsics:
         """The same as the library's type."""
         return CameraIntrinsics(**self.model_dump())
@@ -44,10 +57,10 @@ class CaptureFile(BaseModel):
     Attributes:
         unit: Of the cloud's coordinates and of `T_image_cloud`'s translation; of one depth count
             where `depth_scale_m` is not given.
-        cloud: PLY file in the folder.
+        cloud: Cloud in the folder: PLY, PCD or PTX.
         cloud_width: Width of an organised cloud, where neither PLY header nor image tells it.
         cloud_height: Its height.
-        depth: Depth image in the folder, 16 bits.
+        depth: Depth image in the folder: whole numbers of 16 bits or more, or floats.
         depth_scale_m: Metres per count of the depth image.
         image: Picture in the folder.
         intrinsics: Of the image; of the depth image too, unless `cloud_intrinsics` is there.
@@ -80,7 +93,7 @@ class CaptureFile(BaseModel):
             raise ValueError("'cloud' and 'depth' are both given; keep the one that is to be used")
         if (self.cloud_width is None) != (self.cloud_height is None):
             raise ValueError("cloud_width and cloud_height belong together; give both or neither")
-        if self.depth_scale_m is not None and self.depth_scale_m > _MAX_DEPTH_SCALE_M:
+        if self.depth_scale_m is not None and not is_depth_scale(self.depth_scale_m):
             raise ValueError(
                 f"depth_scale_m is in metres per count (0.001 for millimetres), found {self.depth_scale_m}"
             )

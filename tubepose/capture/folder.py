@@ -1,4 +1,4 @@
-"""Captures as folders (`capture.yaml` beside a cloud or a depth image) and as single PLY files."""
+"""Captures as folders: `capture.yaml` beside a cloud or a depth image."""
 
 from __future__ import annotations
 
@@ -10,10 +10,21 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tubepose.capture.description import CAPTURE_FILE, CLOUD_FILE, DEPTH_FILE, IMAGE_FILES, CaptureFile, Unit
+from tubepose.capture.description import (
+    CAPTURE_FILE,
+    CLOUD_FILE,
+    CLOUD_FILES,
+    DEPTH_FILE,
+    DEPTH_FILES,
+    IMAGE_FILES,
+    CaptureFile,
+    Unit,
+)
+from tubepose.capture.formats.cloud import CloudFile
+from tubepose.capture.formats.cloud_files import read_cloud, unit_of
+from tubepose.capture.formats.depth_images import read_depth
 from tubepose.capture.frame import RgbdFrame
-from tubepose.capture.images import read_depth_counts, read_picture
-from tubepose.capture.ply import PlyCloud, read_ply
+from tubepose.capture.images import read_picture
 from tubepose.capture.registration import METRES_PER_UNIT, clean_cloud, depth_to_metres, project_cloud
 from tubepose.errors import CaptureError
 from tubepose.labware.reading import read_yaml, validate
@@ -32,11 +43,13 @@ class FolderCapture:
         path: The folder.
         unit: Unit of the cloud where the user gave one; it goes before `capture.yaml`. ``mm`` is the unit of depth
             counts without a scale too.
+        depth_scale_m: Metres per count of a depth image where the user gave them; they go before all else.
     """
 
     name: str
     path: Path
     unit: Unit | None = None
+    depth_scale_m: float | None = None
 
     def frames(self) -> Iterator[RgbdFrame]:
         """Yield the one frame.
@@ -47,14 +60,26 @@ class FolderCapture:
         found = _described(self.path) if (self.path / CAPTURE_FILE).is_file() else _guessed(self.path)
         if self.unit is not None and (found.depth is None or self.unit != "m"):  # no depth count is a metre
             found = found.model_copy(update={"unit": self.unit})
-        scale = METRES_PER_UNIT[found.unit]
         image = read_picture(self.path / found.image) if found.image is not None else None
         if found.depth is not None:
-            cloud = _depth_cloud(self.path / found.depth, found)
+            cloud, scale = _depth_cloud(self.path / found.depth, found, self.depth_scale_m), METRES_PER_UNIT[found.unit]
         else:
-            cloud, colours = _ply_cloud(self.path / (found.cloud or CLOUD_FILE), found, image, scale)
+            cloud, colours, scale = self._cloud(found, image)
             image = colours if image is None else image
         yield self._frame(found, image, cloud, scale)
+
+    def _cloud(
+        self, found: CaptureFile, image: NDArray[np.uint8] | None
+    ) -> tuple[FloatArray, NDArray[np.uint8] | None, float]:
+        """The cloud in metres, organised where that is known, its colours as an image, and metres per unit."""
+        path = self.path / (found.cloud or CLOUD_FILE)
+        file = read_cloud(path)
+        described = (self.path / CAPTURE_FILE).is_file()
+        scale = METRES_PER_UNIT[unit_of(path, file, found.unit if described else self.unit)]
+        size = _organised_size(path, found, file, image)
+        cloud = _reshape(clean_cloud(file.xyz, scale), size)
+        # Colours belong to the cloud's own pixels; after a projection they would not be an image.
+        return cloud, _colour_image(file, size) if found.T_image_cloud is None else None, scale
 
     def _frame(self, found: CaptureFile, image: NDArray[np.uint8] | None, cloud: FloatArray, scale: float) -> RgbdFrame:
         intrinsics = found.intrinsics.camera() if found.intrinsics is not None else None
@@ -83,47 +108,14 @@ class FolderCapture:
         )
 
 
-@dataclass(frozen=True, slots=True)
-class PlyCapture:
-    """One frame in a PLY file of its own; metres unless the user gave a unit.
-
-    Attributes:
-        name: As the tables show it.
-        path: The file.
-        unit: Unit of the coordinates; None means metres.
-    """
-
-    name: str
-    path: Path
-    unit: Unit | None = None
-
-    def frames(self) -> Iterator[RgbdFrame]:
-        """Yield the one frame; its picture comes from the vertex colours of an organised cloud.
-
-        Raises:
-            CaptureError: The file is missing, cut, or no PLY.
-        """
-        ply = read_ply(self.path)
-        cloud = clean_cloud(ply.xyz, METRES_PER_UNIT[self.unit or "m"])
-        organised = ply.size is not None
-        yield RgbdFrame(
-            cloud_m=_reshape(cloud, ply.size),
-            image=_colour_image(ply, ply.size),
-            intrinsics=None,
-            timestamp_ns=None,
-            capture=self.name,
-            organised=organised,
-        )
-
-
 def is_capture_folder(path: Path) -> bool:
-    """True for a folder with `capture.yaml`, `cloud.ply` or `depth.png`."""
-    return any((path / name).is_file() for name in (CAPTURE_FILE, CLOUD_FILE, DEPTH_FILE))
+    """True for a folder with `capture.yaml`, `cloud.ply` or `depth.png`, or one of these in another format."""
+    return any((path / name).is_file() for name in (CAPTURE_FILE, *CLOUD_FILES, *DEPTH_FILES))
 
 
 def is_remains(path: Path) -> bool:
     """True for a folder with a file of a capture, its name in capitals or not."""
-    usual = {CAPTURE_FILE, CLOUD_FILE, DEPTH_FILE, *IMAGE_FILES}
+    usual = {CAPTURE_FILE, *CLOUD_FILES, *DEPTH_FILES, *IMAGE_FILES}
     return any(entry.name.casefold() in usual and entry.is_file() for entry in path.iterdir())
 
 
@@ -149,14 +141,14 @@ def _guessed(folder: Path) -> CaptureFile:
         )
     if "cloud" not in files:
         raise CaptureError(
-            f"{folder}: {DEPTH_FILE} without {CAPTURE_FILE}; write one with 'unit: mm' (or depth_scale_m) and "
+            f"{folder}: {files['depth']} without {CAPTURE_FILE}; write one with 'unit: mm' (or depth_scale_m) and "
             "'intrinsics: {width: , height: , fx: , fy: , cx: , cy: }'"
         )
     return CaptureFile(unit="m", cloud=files["cloud"], image=files.get("image"))
 
 
 def _usual_files(folder: Path) -> dict[str, str]:
-    kinds = (("cloud", (CLOUD_FILE,)), ("depth", (DEPTH_FILE,)), ("image", IMAGE_FILES))
+    kinds = (("cloud", CLOUD_FILES), ("depth", DEPTH_FILES), ("image", IMAGE_FILES))
     found = {kind: [name for name in names if (folder / name).is_file()] for kind, names in kinds}
     return {kind: names[0] for kind, names in found.items() if names}
 
@@ -167,50 +159,48 @@ def _cloud_or_depth(folder: Path, files: dict[str, str]) -> dict[str, Any]:
         return there
     if there:
         raise CaptureError(
-            f"{folder}: both {CLOUD_FILE} and {DEPTH_FILE}; name one by 'cloud:' or 'depth:' in {CAPTURE_FILE}"
+            f"{folder}: both {files['cloud']} and {files['depth']}; name one by 'cloud:' or 'depth:' in {CAPTURE_FILE}"
         )
     raise CaptureError(
         f"{folder}: neither {CLOUD_FILE} nor {DEPTH_FILE}; name the file by 'cloud:' or 'depth:' in {CAPTURE_FILE}"
     )
 
 
-def _depth_cloud(path: Path, found: CaptureFile) -> FloatArray:
+def _depth_cloud(path: Path, found: CaptureFile, given_scale_m: float | None) -> FloatArray:
     camera = found.cloud_intrinsics or found.intrinsics
     if camera is None:
         raise CaptureError(
             f"{path}: a depth image needs the camera's intrinsics; write into {CAPTURE_FILE}: "
             "'intrinsics: {width: , height: , fx: , fy: , cx: , cy: }'"
         )
-    scale = found.depth_scale_m if found.depth_scale_m is not None else METRES_PER_UNIT[found.unit]
-    if scale == 1:
+    counts = read_depth(path)
+    known = (given_scale_m, found.depth_scale_m, METRES_PER_UNIT[found.unit])
+    scale = next(value for value in known if value is not None)
+    if scale == 1 and counts.dtype.kind != "f":
         raise CaptureError(
-            f"{path}: 16-bit counts cannot be whole metres; write 'unit: mm', or 'depth_scale_m:' (metres per count) "
-            f"into {CAPTURE_FILE}"
+            f"{path}: {counts.dtype.itemsize * 8}-bit counts cannot be whole metres; write 'unit: mm', or "
+            f"'depth_scale_m:' (metres per count) into {CAPTURE_FILE}"
         )
-    counts = read_depth_counts(path)
     key = "cloud_intrinsics" if found.cloud_intrinsics is not None else "intrinsics"
     _same_size(path.parent, path.name, counts.shape, key, (camera.height, camera.width))
     return camera.camera().backproject(depth_to_metres(counts, scale))
 
 
-def _ply_cloud(
-    path: Path, found: CaptureFile, image: NDArray[np.uint8] | None, scale: float
-) -> tuple[FloatArray, NDArray[np.uint8] | None]:
-    """The cloud, organised where that is known, and its colours as an image."""
-    ply = read_ply(path)
-    size = ply.size
+def _organised_size(
+    path: Path, found: CaptureFile, file: CloudFile, image: NDArray[np.uint8] | None
+) -> tuple[int, int] | None:
+    """(width, height) of a cloud: as `capture.yaml` says, as the file says, as the image is where that fits."""
     if found.cloud_width is not None and found.cloud_height is not None:
         size = (found.cloud_width, found.cloud_height)
-        if size[0] * size[1] != len(ply.xyz):
+        if size[0] * size[1] != len(file.xyz):
             raise CaptureError(
                 f"{path}: {CAPTURE_FILE} says cloud_width {size[0]} and cloud_height {size[1]}, that is "
-                f"{size[0] * size[1]} points; the file holds {len(ply.xyz)}"
+                f"{size[0] * size[1]} points; the file holds {len(file.xyz)}"
             )
-    elif size is None and image is not None and image.shape[0] * image.shape[1] == len(ply.xyz):
-        size = (image.shape[1], image.shape[0])
-    cloud = _reshape(clean_cloud(ply.xyz, scale), size)
-    # Colours belong to the cloud's own pixels; after a projection they would not be an image.
-    return cloud, _colour_image(ply, size) if found.T_image_cloud is None else None
+        return size
+    if file.size is None and image is not None and image.shape[0] * image.shape[1] == len(file.xyz):
+        return image.shape[1], image.shape[0]
+    return file.size
 
 
 def _reshape(points_m: FloatArray, size: tuple[int, int] | None) -> FloatArray:
@@ -218,10 +208,10 @@ def _reshape(points_m: FloatArray, size: tuple[int, int] | None) -> FloatArray:
     return points_m.reshape(height, width, 3)
 
 
-def _colour_image(ply: PlyCloud, size: tuple[int, int] | None) -> NDArray[np.uint8] | None:
-    if ply.rgb is None or size is None:
+def _colour_image(file: CloudFile, size: tuple[int, int] | None) -> NDArray[np.uint8] | None:
+    if file.colours is None or size is None:
         return None
-    return ply.rgb.reshape(size[1], size[0], 3)
+    return file.colours.reshape(size[1], size[0], *file.colours.shape[1:])
 
 
 def _same_size(

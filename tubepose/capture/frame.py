@@ -9,6 +9,11 @@ from numpy.typing import NDArray
 
 from tubepose.transforms import FloatArray
 
+MOST_PIXELS = 1 << 26
+"""No camera of racks has more; a file of a few bytes can claim any number."""
+NEAREST_FOCAL, FARTHEST_FOCAL = 0.05, 1000.0
+"""Focal lengths of pinhole cameras, as shares of the picture's longer side: 169 to 0.06 degrees."""
+
 
 @dataclass(frozen=True, slots=True)
 class CameraIntrinsics:
@@ -48,6 +53,20 @@ class CameraIntrinsics:
         """Organised cloud (H, W, 3) in metres from a depth image (H, W) in metres; NaN depth gives NaN points."""
         return np.asarray(self.rays() * np.asarray(depth_m, dtype=float)[..., None])
 
+    @property
+    def fault(self) -> str:
+        """What cannot be of these numbers, in words; empty where a camera can have them."""
+        side = max(self.width, self.height)
+        if not 0 < self.width * self.height <= MOST_PIXELS:
+            return f"{self.width} x {self.height} pixels; expected at most {MOST_PIXELS} in all"
+        for name, value in (("fx", self.fx), ("fy", self.fy)):
+            if not NEAREST_FOCAL * side <= value <= FARTHEST_FOCAL * side:
+                return f"{name} {value:g} for a picture of {side} pixels; expected a focal length in pixels"
+        for name, value in (("cx", self.cx), ("cy", self.cy)):
+            if not abs(value) <= FARTHEST_FOCAL * side:
+                return f"{name} {value:g} for a picture of {side} pixels; expected the principal point in pixels"
+        return ""
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Averaging:
@@ -82,6 +101,7 @@ class RgbdFrame:
         sensor: What recorded it, as far as is known.
         simulated: True when the capture says that it is simulated.
         averaging: What it was fused of; None for a frame as it was recorded.
+        notes: What was passed over or taken for granted when it was read, in words.
     """
 
     cloud_m: FloatArray
@@ -94,6 +114,7 @@ class RgbdFrame:
     sensor: str = "unknown"
     simulated: bool = False
     averaging: Averaging | None = None
+    notes: tuple[str, ...] = ()
 
     @property
     def points_m(self) -> FloatArray:

@@ -1,16 +1,27 @@
-"""Image files and encoded images: 8-bit pictures in RGB order, 16-bit depth."""
+"""Image files and encoded images: 8-bit pictures in RGB order, depth."""
 
 from __future__ import annotations
 
+import io
+import struct
+import warnings
+import zlib
 from pathlib import Path
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from PIL import Image
 
+from tubepose.capture.frame import MOST_PIXELS
 from tubepose.errors import CaptureError
 
 _PNG = b"\x89PNG"
+# What a damaged header makes Pillow raise.
+_UNREADABLE = (
+    *(OSError, SyntaxError, ValueError, struct.error, IndexError, KeyError, TypeError),
+    *(ArithmeticError, AttributeError, MemoryError, RuntimeError),
+)
 # Percentiles that a picture of more than 8 bits is stretched between: a reflection must not turn the rest black.
 _STRETCH_PERCENT = (0.5, 99.5)
 # Noisy depth repeats nothing but runs of invalid pixels: no search for strings is 10 times as fast and nearly as small.
@@ -28,22 +39,51 @@ def read_bytes(path: Path) -> bytes:
         raise CaptureError(f"{path}: cannot be read: {problem.strerror}") from None
 
 
+def _claimed_pixels(data: bytes) -> int:
+    """Pixels that the header of an image claims; 0 where it is none."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        try:
+            with Image.open(io.BytesIO(data)) as image:
+                return image.width * image.height
+        except Image.DecompressionBombError:
+            return MOST_PIXELS + 1
+        except _UNREADABLE:
+            return 0
+
+
+def _is_cut_png(data: bytes) -> bool:
+    """Whether a PNG breaks off before its end, or has a chunk of another checksum: libpng would complain on stderr."""
+    at = len(_PNG) + 4
+    while at + 12 <= len(data):
+        length = int.from_bytes(data[at : at + 4], "big")
+        end = at + 8 + length
+        if end + 4 > len(data) or zlib.crc32(data[at + 4 : end]) != int.from_bytes(data[end : end + 4], "big"):
+            return True
+        if data[at + 4 : at + 8] == b"IEND":
+            return False
+        at = end + 4
+    return True
+
+
 def decode(data: bytes, where: str) -> NDArray[np.generic]:
-    """Pixels of a PNG or JPEG as they are stored, shape (H, W) or (H, W, C), OpenCV's channel order.
+    """Pixels of a PNG, JPEG or TIFF as they are stored, shape (H, W) or (H, W, C), OpenCV's channel order.
 
     Raises:
-        CaptureError: Cut or no image at all. A PNG without its end is refused before libpng complains on stderr.
+        CaptureError: Cut, damaged, no image at all, or one of more than `MOST_PIXELS`.
     """
-    cut = data.startswith(_PNG) and b"IEND" not in data
+    claimed = _claimed_pixels(data)
+    if claimed > MOST_PIXELS:
+        raise CaptureError(f"{where}: claims more than {MOST_PIXELS} pixels; expected a camera's picture")
+    cut = data.startswith(_PNG) and _is_cut_png(data)
     flags = cv2.IMREAD_UNCHANGED | cv2.IMREAD_IGNORE_ORIENTATION
     try:
-        pixels = None if cut or not data else cv2.imdecode(np.frombuffer(data, np.uint8), flags)
+        pixels = None if cut or not claimed else cv2.imdecode(np.frombuffer(data, np.uint8), flags)
     except cv2.error:  # a header that claims more pixels than OpenCV opens
         pixels = None
     if pixels is None:
-        raise CaptureError(
-            f"{where}: {'truncated' if cut else 'cannot be decoded'}; expected a whole PNG or JPEG image"
-        )
+        what = "truncated or damaged" if cut else "cannot be decoded"
+        raise CaptureError(f"{where}: {what}; expected a whole PNG, JPEG or TIFF image")
     return np.asarray(pixels)
 
 
@@ -67,24 +107,26 @@ def read_picture(path: Path) -> NDArray[np.uint8]:
     return to_picture(decode(read_bytes(path), str(path)), bgr=True)
 
 
-def read_depth_counts(path: Path) -> NDArray[np.uint16]:
-    """A depth PNG as stored, shape (H, W); only 16 bits and one channel hold depth."""
-    return depth_counts(decode(read_bytes(path), str(path)), str(path))
-
-
-def depth_counts(counts: NDArray[np.generic], where: str) -> NDArray[np.uint16]:
-    """Decoded pixels that must be depth, shape (H, W).
+def depth_counts(counts: NDArray[np.generic], where: str) -> NDArray[np.generic]:
+    """Decoded pixels that must be depth, shape (H, W): whole numbers of 16 bits or more, or floats.
 
     Raises:
-        CaptureError: Other than 16 bits and one channel.
+        CaptureError: Fewer bits, no numbers, or more than one channel.
     """
-    if counts.dtype != np.uint16 or counts.ndim != 2:
-        channels = 1 if counts.ndim == 2 else counts.shape[2]
+    if counts.ndim != 2 or counts.dtype.kind not in "uif" or counts.dtype.itemsize < 2:
+        channels = 1 if counts.ndim == 2 else counts.shape[2] if counts.ndim == 3 else f"{counts.ndim}-dimensional"
         raise CaptureError(
-            f"{where}: expected a depth image of 16 bits and 1 channel, found {counts.dtype.itemsize * 8} bits and "
-            f"{channels} channel(s); record the raw depth, not a coloured picture of it"
+            f"{where}: expected a depth image of 16 bits and 1 channel (or of floats), found "
+            f"{counts.dtype.itemsize * 8} bits and {channels} channel(s); record the raw depth, not a coloured "
+            "picture of it"
         )
-    return counts.astype(np.uint16, copy=False)
+    return counts
+
+
+def is_depth_png(data: bytes | NDArray[np.uint8]) -> bool:
+    """Whether an encoded image is a PNG of 16 bits and one channel, by its header (PNG specification, IHDR)."""
+    start = bytes(data[:26])
+    return start.startswith(_PNG) and len(start) == 26 and (start[24], start[25]) == (16, 0)
 
 
 def encode_png(pixels: NDArray[np.uint8] | NDArray[np.uint16]) -> bytes:

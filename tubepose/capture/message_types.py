@@ -10,6 +10,11 @@ POINT_CLOUD = "sensor_msgs/msg/PointCloud2"
 IMAGE = "sensor_msgs/msg/Image"
 COMPRESSED_IMAGE = "sensor_msgs/msg/CompressedImage"
 CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
+# Read, never written.
+TRANSFORMS = "tf2_msgs/msg/TFMessage"
+TRANSFORM = "geometry_msgs/msg/Transform"
+STRING = "std_msgs/msg/String"
+FLOAT32 = "std_msgs/msg/Float32"
 
 _RULE = "=" * 80
 _HEADER = f"""

@@ -13,6 +13,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from tubepose.capture.description import Unit
+from tubepose.capture.formats.cloud import CloudFile, colours_of
+from tubepose.capture.formats.text_numbers import read_rows, whole_number
 from tubepose.capture.images import read_bytes
 from tubepose.errors import CaptureError
 from tubepose.transforms import FloatArray
@@ -25,23 +28,27 @@ _TYPES = {
 }  # fmt: skip
 _ORDERS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
 # Written by PhoXi tools, Zivid tools and range-scan software, as obj_info or as a comment.
-_SIZE_LINE = re.compile(r"(?:obj_info|comment)\s+(?:num_)?(cols|rows|width|height)\s*[:=]?\s*(\d+)\s*$", re.IGNORECASE)
+_SIZE_LINE = re.compile(
+    r"(?:obj_info|comment)\s+(?:num_)?(cols|rows|width|height)\s*[:=]?\s*([0-9]{1,15})\s*$", re.IGNORECASE
+)
+# PhoXi Control: obj_info Photoneo PLY PointCloud ( Width = 2064; Height = 1544; Ordered)
+_SIZE_PAIR = re.compile(
+    r"(?:obj_info|comment)\b.*\bwidth\s*[:=]\s*([0-9]{1,15})\b.*\bheight\s*[:=]\s*([0-9]{1,15})\b", re.IGNORECASE
+)
+_UNIT_LINE = re.compile(r"(?:obj_info|comment)\b.*\bunits?\s*(?:[:=]|is)?\s*([a-z]+)\s*$", re.IGNORECASE)
+_UNITS: dict[str, Unit] = {
+    **dict.fromkeys(("m", "metre", "metres", "meter", "meters"), "m"),
+    **dict.fromkeys(("mm", "millimetre", "millimetres", "millimeter", "millimeters"), "mm"),
+}
+# PhoXi Control and Zivid's programs write millimetres; a line that only names the camera is somebody else's.
+_MILLIMETRE_WRITERS = re.compile(
+    r"obj_info\s+(?:photoneo|zivid)\b|comment\s+(?:created|generated|written|exported)\s+(?:by|with)\s+(?:photoneo|phoxi"
+    r"|zivid)\b",
+    re.IGNORECASE,
+)
 _MAX_HEADER_BYTES = 65536
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class PlyCloud:
-    """The vertices of a PLY file.
-
-    Attributes:
-        xyz: Array of shape (N, 3) in the file's unit; invalid points as the file has them.
-        rgb: Array of shape (N, 3), uint8; None without colours.
-        size: (width, height) where the header says how the vertices are organised and their number agrees.
-    """
-
-    xyz: FloatArray
-    rgb: NDArray[np.uint8] | None
-    size: tuple[int, int] | None
+# PCL's `camera` has viewportx and viewporty, PhoXi Control's `phoxi_frame_params` frame_width and frame_height.
+_SIZE_PROPERTIES = (("viewportx", "viewporty"), ("frame_width", "frame_height"))
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,10 +64,13 @@ class _Header:
     elements: list[_Element]
     size: dict[str, int]
     body: int
+    unit: Unit | None = None
 
 
-def read_ply(path: Path) -> PlyCloud:
-    """Read the vertices of a PLY file; other elements and properties are passed over.
+def read_ply(path: Path) -> CloudFile:
+    """Read the vertices of a PLY file.
+
+    Of other elements only the size of the picture is read, where PCL or PhoXi Control wrote it there.
 
     Raises:
         CaptureError: Missing, cut, or no PLY with x, y and z.
@@ -71,17 +81,18 @@ def read_ply(path: Path) -> PlyCloud:
     if "vertex" not in names:
         raise CaptureError(f"{path}: expected a PLY with 'element vertex', found {', '.join(names) or 'no element'}")
     at = names.index("vertex")
-    before, vertex = header.elements[:at], header.elements[at]
+    vertex = header.elements[at]
     properties = [name for name, _ in vertex.properties]
     missing = [axis for axis in "xyz" if axis not in properties]
     if missing:
         found = ", ".join(properties) or "none"
         raise CaptureError(f"{path}: expected the vertex properties x, y and z, found {found}")
-    columns = _read_ascii(path, data, header, before, vertex) if not header.order else None
-    if columns is None:
-        columns = _read_binary(path, data, header, before, vertex)
-    xyz = np.stack([columns[axis].astype(np.float64) for axis in "xyz"], axis=1)
-    return PlyCloud(xyz, _colours(vertex, columns), _size(header, vertex.count))
+    table = _read_element(path, data, header, at)
+    if len(table[properties[0]]) < vertex.count:
+        raise _cut(path, vertex.count, len(table[properties[0]]))
+    with np.errstate(invalid="ignore"):  # signalling NaN
+        xyz = np.stack([table[axis].astype(np.float64) for axis in "xyz"], axis=1)
+    return CloudFile(xyz, colours_of(table), _size(path, data, header, vertex.count), header.unit)
 
 
 def _read_header(path: Path, data: bytes) -> _Header:
@@ -93,28 +104,49 @@ def _read_header(path: Path, data: bytes) -> _Header:
     order: str | None = None
     elements: list[_Element] = []
     size: dict[str, int] = {}
+    unit: Unit | None = None
     for line in data[: end.start()].decode("latin-1").splitlines():
         words = line.split()
-        match = _SIZE_LINE.match(line.strip())
-        if match:
-            key = {"width": "cols", "height": "rows"}.get(match[1].lower(), match[1].lower())
-            size[key] = int(match[2])
+        if words[:1] in (["comment"], ["obj_info"]):
+            size |= _stated_size(line.strip())
+            unit = _stated_unit(line.strip()) or unit
         elif words[:1] == ["format"] and len(words) > 1:
             order = _ORDERS.get(words[1])
-        elif words[:1] == ["element"] and len(words) == 3 and words[2].isdigit():
-            elements.append(_Element(words[1], int(words[2]), []))
+        elif words[:1] == ["element"]:
+            elements.append(_Element(words[1] if len(words) > 1 else "", _count(path, words), []))
         elif words[:1] == ["property"] and elements:
             elements[-1].properties.append(_property(path, words))
     if order is None:
         raise CaptureError(f"{path}: expected a PLY of format {', '.join(_ORDERS)}; found none of them in its header")
-    return _Header(order, elements, size, end.end())
+    return _Header(order, elements, size, end.end(), unit)
+
+
+def _stated_size(line: str) -> dict[str, int]:
+    if both := _SIZE_PAIR.match(line):
+        return {"cols": int(both[1]), "rows": int(both[2])}
+    if one := _SIZE_LINE.match(line):
+        return {{"width": "cols", "height": "rows"}.get(one[1].lower(), one[1].lower()): int(one[2])}
+    return {}
+
+
+def _stated_unit(line: str) -> Unit | None:
+    if said := _UNIT_LINE.match(line):
+        return _UNITS.get(said[1].lower())
+    return "mm" if _MILLIMETRE_WRITERS.match(line) else None
+
+
+def _count(path: Path, words: list[str]) -> int:
+    count = whole_number(words[2]) if len(words) == 3 else None
+    if count is None:
+        raise CaptureError(f"{path}: expected 'element NAME COUNT' in the PLY header, found {' '.join(words)[:80]!r}")
+    return count
 
 
 def _property(path: Path, words: list[str]) -> tuple[str, str]:
     if words[1:2] == ["list"]:
         return words[-1], "list"
     if len(words) != 3 or words[1] not in _TYPES:
-        raise CaptureError(f"{path}: expected 'property TYPE NAME' in the PLY header, found {' '.join(words)!r}")
+        raise CaptureError(f"{path}: expected 'property TYPE NAME' in the PLY header, found {' '.join(words)[:80]!r}")
     return words[2], _TYPES[words[1]]
 
 
@@ -125,36 +157,26 @@ def _record(path: Path, header: _Header, element: _Element) -> np.dtype[np.void]
     return np.dtype([(f"{i}", header.order + kind) for i, (_, kind) in enumerate(element.properties)])
 
 
-def _read_binary(
-    path: Path, data: bytes, header: _Header, before: list[_Element], vertex: _Element
-) -> dict[str, NDArray[np.generic]]:
-    start = header.body + sum(e.count * _record(path, header, e).itemsize for e in before)
-    layout = _record(path, header, vertex)
-    whole = max(0, len(data) - start) // layout.itemsize
-    if whole < vertex.count:
-        raise _cut(path, vertex.count, whole)
-    table = np.frombuffer(data, layout, count=vertex.count, offset=start)
-    return {name: table[f"{i}"] for i, (name, _) in enumerate(vertex.properties)}
-
-
-def _read_ascii(
-    path: Path, data: bytes, header: _Header, before: list[_Element], vertex: _Element
-) -> dict[str, NDArray[np.generic]]:
-    lines = [line for line in data[header.body :].decode("latin-1").splitlines() if line.strip()]
-    start = sum(element.count for element in before)
-    rows = lines[start : start + vertex.count]
-    if len(rows) < vertex.count:
-        raise _cut(path, vertex.count, len(rows))
-    wanted = len(_record(path, header, vertex).names or ())
-    try:
-        table = np.loadtxt(rows, dtype=np.float64, comments=None, ndmin=2, usecols=range(wanted)) if rows else None
-    except (ValueError, IndexError):
-        raise CaptureError(
-            f"{path}: a vertex line is cut or no number; expected {wanted} numbers in each of {vertex.count} lines"
-        ) from None
-    if table is None:
-        table = np.empty((0, wanted))
-    return {name: table[:, i] for i, (name, _) in enumerate(vertex.properties)}
+def _read_element(path: Path, data: bytes, header: _Header, at: int) -> dict[str, NDArray[np.generic]]:
+    """Columns of an element by name; shorter than the header says where the file ends before."""
+    layout = _record(path, header, header.elements[at])
+    before = [(element.count, _record(path, header, element)) for element in header.elements[:at]]
+    count = header.elements[at].count
+    names = [name for name, _ in header.elements[at].properties]
+    if not header.order:
+        skipped = sum(n for n, _ in before), sum(n * len(record.names or ()) for n, record in before)
+        try:
+            rows = read_rows(data[header.body :], skipped, count, len(names))
+        except ValueError:
+            raise CaptureError(
+                f"{path}: a {header.elements[at].name} line is cut or no number; expected {len(names)} "
+                f"numbers in each of {count} lines"
+            ) from None
+        return {name: rows[:, i] for i, name in enumerate(names)}
+    start = min(len(data), header.body + sum(n * record.itemsize for n, record in before))
+    whole = (len(data) - start) // layout.itemsize if layout.itemsize else 0
+    table = np.frombuffer(data, layout, count=min(count, whole), offset=start)
+    return {name: table[f"{i}"] for i, name in enumerate(names)}
 
 
 def _cut(path: Path, promised: int, found: int) -> CaptureError:
@@ -163,17 +185,22 @@ def _cut(path: Path, promised: int, found: int) -> CaptureError:
     )
 
 
-def _colours(vertex: _Element, columns: dict[str, NDArray[np.generic]]) -> NDArray[np.uint8] | None:
-    kinds = dict(vertex.properties)
-    if any(kinds.get(name) != "u1" for name in ("red", "green", "blue")):
-        return None
-    return np.stack([columns[name].astype(np.uint8) for name in ("red", "green", "blue")], axis=1)
-
-
-def _size(header: _Header, count: int) -> tuple[int, int] | None:
-    width, height = header.size.get("cols", 0), header.size.get("rows", 0)
+def _size(path: Path, data: bytes, header: _Header, count: int) -> tuple[int, int] | None:
+    """Width and height by the header's lines, else by an element beside the vertices."""
+    stated = [(header.size.get("cols", 0), header.size.get("rows", 0))]
+    for at, element in enumerate(header.elements):
+        kinds = dict(element.properties)
+        pair = next((names for names in _SIZE_PROPERTIES if set(names) <= kinds.keys()), None)
+        if pair is not None and element.count == 1 and not _has_list(header.elements[: at + 1]):
+            values = [_read_element(path, data, header, at)[name] for name in pair]
+            if all(len(value) and 0 < float(value[0]) < 2**31 for value in values):
+                stated.append((int(values[0][0]), int(values[1][0])))
     # One row or one column is how a cloud without pixels is written.
-    return (width, height) if min(width, height) > 1 and width * height == count else None
+    return next(((w, h) for w, h in stated if min(w, h) > 1 and w * h == count), None)
+
+
+def _has_list(elements: list[_Element]) -> bool:
+    return any(kind == "list" for element in elements for _, kind in element.properties)
 
 
 def encode_ply(points_m: FloatArray, size: tuple[int, int] | None) -> bytes:

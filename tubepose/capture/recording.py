@@ -1,53 +1,51 @@
-"""MCAP files record by record: what is in them, and every whole message even of a cut file."""
+"""What a recording holds, found in a first pass over it, and its messages in a second one."""
 
 from __future__ import annotations
 
-import struct
-from collections.abc import Callable, Collection, Iterator
-from dataclasses import dataclass
-from functools import cache
+from collections.abc import Collection, Iterable, Iterator
+from contextlib import suppress
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-import zstandard
-from mcap.exceptions import EndOfFile, InvalidMagic, McapError, RecordLengthLimitExceeded
-from mcap.records import Channel, Message, Metadata, Schema
-from mcap.stream_reader import StreamReader
-from mcap.well_known import MessageEncoding, SchemaEncoding
-from mcap.writer import MCAP0_MAGIC
-from mcap_ros2.decoder import DecoderFactory
-
-from tubepose.capture.message_types import DEFINITIONS
-from tubepose.capture.topics import Topic
+from tubepose.capture.formats.containers import parts_before, read_raw, recording_suffix
+from tubepose.capture.formats.decoding import decode_message, stamp_ns, type_of
+from tubepose.capture.formats.raw_messages import BrokenRecordingError, Note, RawMessage
+from tubepose.capture.message_types import CAMERA_INFO, FLOAT32, STRING, TRANSFORM, TRANSFORMS
+from tubepose.capture.realsense import DepthUnits, stream_extrinsics
+from tubepose.capture.static_transforms import StaticTransforms
+from tubepose.capture.topics import Topic, told_types
 from tubepose.errors import CaptureError
 
 METADATA_NAME = "tubepose"
 
-# What a cut or damaged file makes mcap and its decompressors raise (lz4: RuntimeError; checksums and text: ValueError).
-_BROKEN = (McapError, zstandard.ZstdError, struct.error, ValueError, RuntimeError)
-# Decoding one message: lengths and text that do not fit.
-_UNDECODABLE = (McapError, struct.error, ValueError, IndexError)
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Recording:
-    """What a first pass over a file finds.
+    """What a first pass over a recording finds.
 
     Attributes:
-        topics: Topics of the message types that are read, by name, in file order.
+        topics: Topics of pictures, depth, clouds and cameras, by name, in file order.
+        unread: Names of the types of all other topics, by topic.
         metadata: What our own writer noted (sensor, simulated).
+        transforms: Between coordinate frames that do not move against each other.
+        units: Metres per count of depth images that the RealSense SDK recorded.
         broken: What ended the pass before the end of the file; None for a whole file.
+        problems: Messages of the types that are read that could not be.
     """
 
-    topics: dict[str, Topic]
-    metadata: dict[str, str]
-    broken: Exception | None
+    topics: dict[str, Topic] = field(default_factory=dict)
+    unread: dict[str, str] = field(default_factory=dict)
+    metadata: dict[str, str] = field(default_factory=dict)
+    transforms: StaticTransforms = field(default_factory=StaticTransforms)
+    units: DepthUnits = field(default_factory=DepthUnits)
+    broken: BrokenRecordingError | None = None
+    problems: list[str] = field(default_factory=list)
 
     def broken_text(self, path: Path, frames: int) -> str:
         """One line about the cut, with the number of frames before it."""
-        cut = isinstance(self.broken, EndOfFile | RecordLengthLimitExceeded | struct.error)
-        reason = f" ({self.broken})" if str(self.broken) and not isinstance(self.broken, struct.error) else ""
-        what = "truncated" if cut else "truncated or damaged"
+        reason = f" ({self.broken.reason})" if self.broken is not None and self.broken.reason else ""
+        what = "truncated" if self.broken is not None and self.broken.cut else "truncated or damaged"
         if frames == 0:
             return f"{path}: {what} before the end of its first frame{reason}; copy or record it again"
         return f"{path}: {what} after {frames} whole frame(s){reason}; copy or record it again to have the rest"
@@ -55,124 +53,120 @@ class Recording:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class StampedMessage:
-    """One message: its topic, its stamp in nanoseconds (None without one), and its decoded fields."""
+    """One message.
+
+    Attributes:
+        topic: Its topic.
+        stamp_ns: Its stamp, nanoseconds; None without one.
+        fields: What it says; None where it cannot be read.
+        problem: Why it cannot be read; empty otherwise.
+    """
 
     topic: str
     stamp_ns: int | None
     fields: Any
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Entry:
-    schema: Schema
-    channel: Channel
-    message: Message
+    problem: str = ""
 
 
 def index_recording(path: Path) -> Recording:
-    """Find the topics of a file, their stamps, and whether the file is whole.
+    """Find the topics of a recording, their stamps, calibrations, transforms and units, and whether it is whole.
+
+    A part of a split recording that holds no calibration has that of the other parts beside it.
 
     Raises:
-        CaptureError: No MCAP, or no message of a type that is read.
+        CaptureError: No recording, or no message of a type that is read.
     """
-    topics: dict[str, Topic] = {}
-    metadata: dict[str, str] = {}
-    others: set[str] = set()
-    broken: Exception | None = None
+    found = Recording()
+    broken: BrokenRecordingError | None = None
     try:
-        for entry in _entries(path):
-            if isinstance(entry, Metadata):
-                metadata |= entry.metadata if entry.name == METADATA_NAME else {}
-            elif entry.schema.name not in DEFINITIONS:
-                others.add(entry.schema.name)
-            else:
-                name = entry.channel.topic
-                if name not in topics:
-                    topics[name] = Topic(name, entry.schema.name, _decode(entry, path))
-                topics[name].stamps_ns.append(_stamp_ns(entry.message))
-    except InvalidMagic:
-        raise CaptureError(f"{path}: expected an MCAP file, found other content; check the path") from None
-    except _BROKEN as problem:
+        for entry in read_raw(path):
+            _note(found, entry, path)
+    except BrokenRecordingError as problem:
         broken = problem
-    if not topics and broken is None:
-        raise CaptureError(_nothing_text(path, others))
-    return Recording(topics, metadata, broken)
+    for name in [name for name, topic in found.topics.items() if topic.first is None]:
+        del found.topics[name]
+    if not found.topics and broken is None:
+        raise CaptureError(found.problems[0] if found.problems else _nothing_text(path, found.unread))
+    if path.is_file() and not any(topic.infos for topic in found.topics.values()):
+        for part in parts_before(path):
+            with suppress(BrokenRecordingError):
+                for entry in read_raw(part):
+                    if isinstance(entry, RawMessage) and type_of(entry) in (CAMERA_INFO, TRANSFORMS, STRING, FLOAT32):
+                        _note(found, entry, part)
+            if any(topic.infos for topic in found.topics.values()):
+                break
+    return replace(found, broken=broken)
 
 
 def read_messages(path: Path, topics: Collection[str]) -> Iterator[StampedMessage]:
     """Every whole message of some topics in file order; a break just ends them (`index_recording` saw it)."""
-    try:
-        for entry in _entries(path):
-            if isinstance(entry, _Entry) and entry.channel.topic in topics:
-                fields = _decode(entry, path)
-                yield StampedMessage(entry.channel.topic, _stamp_ns(entry.message), fields)
-    except _BROKEN:
+    with suppress(BrokenRecordingError):
+        for entry in _messages(read_raw(path)):
+            kind = type_of(entry) if entry.topic in topics else None
+            if kind is None:
+                continue
+            try:
+                stamp = stamp_ns(entry, kind, str(path))
+                yield StampedMessage(entry.topic, stamp, decode_message(entry, kind, str(path)))
+            except CaptureError as problem:
+                yield StampedMessage(entry.topic, None, None, str(problem))
+
+
+def _messages(entries: Iterable[RawMessage | Note]) -> Iterator[RawMessage]:
+    return (entry for entry in entries if isinstance(entry, RawMessage))
+
+
+def _note(found: Recording, entry: RawMessage | Note, path: Path) -> None:
+    """Add what one message tells to what was found."""
+    if isinstance(entry, Note):
+        found.metadata.update(entry.values if entry.name == METADATA_NAME else {})
         return
-
-
-def _entries(path: Path) -> Iterator[_Entry | Metadata]:
-    """Read a file from its start, without its index: a cut file has none."""
-    schemas: dict[int, Schema] = {}
-    channels: dict[int, Channel] = {}
+    kind = type_of(entry)
+    if kind in (TRANSFORMS, TRANSFORM, STRING, FLOAT32):
+        _note_small(found, entry, kind, str(path))
+    if kind is None or kind in (STRING, FLOAT32, TRANSFORM, TRANSFORMS):
+        found.unread.setdefault(entry.topic, entry.schema)
+        return
+    known = found.topics.get(entry.topic)
+    stamp, fields = None, None
     try:
-        stream = path.open("rb")
-    except OSError as problem:
-        raise CaptureError(f"{path}: cannot be read: {problem.strerror}") from None
-    with stream:
-        if not MCAP0_MAGIC.startswith(stream.read(len(MCAP0_MAGIC))):
-            raise InvalidMagic(b"")
-        stream.seek(0)
-        for record in StreamReader(stream, validate_crcs=True).records:
-            if isinstance(record, Schema):
-                schemas[record.id] = record
-            elif isinstance(record, Channel):
-                channels[record.id] = record
-            elif isinstance(record, Metadata):
-                yield record
-            elif isinstance(record, Message):
-                channel = channels.get(record.channel_id)
-                if channel is None:
-                    raise McapError(f"a message of the unknown channel {record.channel_id}")
-                yield _Entry(schemas.get(channel.schema_id, _NO_SCHEMA), channel, record)
+        stamp = stamp_ns(entry, kind, str(path))
+        if kind == CAMERA_INFO or known is None or known.first is None:
+            fields = decode_message(entry, kind, str(path))
+    except CaptureError as problem:
+        found.problems.append(str(problem))
+    if known is None:
+        known = found.topics[entry.topic] = Topic(entry.topic, kind, fields)
+    elif known.first is None:
+        known = found.topics[entry.topic] = replace(known, first=fields)
+    known.stamps_ns.append(stamp)
+    known.log_times_ns.append(entry.log_time_ns)
+    if kind == CAMERA_INFO and fields is not None:
+        known.note_info(stamp, fields)
 
 
-_NO_SCHEMA = Schema(id=0, name="messages without a schema", encoding="", data=b"")
+def _note_small(found: Recording, entry: RawMessage, kind: str, where: str) -> None:
+    """What transforms and texts tell; one that cannot be read tells nothing."""
+    extrinsics = stream_extrinsics(entry.topic) if kind == TRANSFORM else None
+    if kind == TRANSFORM and extrinsics is None:
+        return
+    if kind in (STRING, FLOAT32) and not found.units.is_told_by(entry.topic):
+        return
+    with suppress(CaptureError):
+        fields = decode_message(entry, kind, where)
+        if kind == TRANSFORMS:
+            for one in fields.transforms:
+                found.transforms.add(one.header.frame_id, one.child_frame_id, one.transform)
+        elif extrinsics is not None:
+            found.transforms.add_inverse(*extrinsics, fields)
+        else:
+            found.units.note(entry.topic, fields.data)
 
 
-def _decode(entry: _Entry, path: Path) -> Any:
-    """Fields of a message of a type that is read, by our own definition of it."""
-    schema, channel = entry.schema, entry.channel
-    if channel.message_encoding != MessageEncoding.CDR:
-        raise CaptureError(
-            f"{path}: {channel.topic} is encoded as {channel.message_encoding or 'nothing'}; "
-            "expected cdr, as 'ros2 bag record -s mcap' writes it"
-        )
-    try:
-        return _decoder(schema.name)(entry.message.data)
-    except _UNDECODABLE as problem:
-        raise CaptureError(
-            f"{path}: a message of {channel.topic} is not the {schema.name} it claims to be: {problem}"
-        ) from None
-
-
-@cache
-def _decoder(name: str) -> Callable[[bytes], Any]:
-    schema = Schema(id=1, name=name, encoding=SchemaEncoding.ROS2, data=DEFINITIONS[name].encode())
-    decoder = DecoderFactory().decoder_for(MessageEncoding.CDR, schema)
-    assert decoder is not None, f"no decoder of {name}"
-    return decoder
-
-
-def _stamp_ns(message: Message) -> int | None:
-    """Stamp of the header, which every type that is read starts with; the log time where the header has none."""
-    order = "<" if message.data[1:2] == b"\x01" else ">"
-    seconds, nanoseconds = struct.unpack_from(f"{order}iI", message.data, 4) if len(message.data) >= 12 else (0, 0)
-    return (int(seconds) * 1_000_000_000 + int(nanoseconds)) or message.log_time or None
-
-
-def _nothing_text(path: Path, others: set[str]) -> str:
-    expected = "expected ROS 2 sensor_msgs/msg/PointCloud2, or Image with depth and CameraInfo"
-    foxglove = sorted(name for name in others if name.startswith("foxglove."))
-    if foxglove:
-        return f"{path}: {', '.join(foxglove)} messages are not read yet; {expected}; record the ROS topics"
-    return f"{path}: nothing to make a frame of; {expected}, found {', '.join(sorted(others)) or 'no messages'}"
+def _nothing_text(path: Path, unread: dict[str, str]) -> str:
+    found = told_types(unread) or "no messages"
+    kind = "ROS 1 or " if recording_suffix(path) == ".bag" else ""
+    return (
+        f"{path}: nothing to make a frame of; expected {kind}ROS 2 sensor_msgs/msg/PointCloud2, or Image with "
+        f"depth and CameraInfo, or Foxglove's PointCloud or images, found {found}; record one of these, decompressed"
+    )

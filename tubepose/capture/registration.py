@@ -43,7 +43,7 @@ def clean_cloud(xyz: ArrayLike, metres_per_unit: float) -> FloatArray:
         metres_per_unit: 1 for metres, 0.001 for millimetres.
     """
     points = np.array(xyz, dtype=np.float64)
-    with np.errstate(invalid="ignore"):  # NaN is no distance either
+    with np.errstate(invalid="ignore", over="ignore"):  # NaN is no distance either
         invalid = ~(np.abs(points) * metres_per_unit < FARTHEST_M).all(axis=-1) | (points == 0).all(axis=-1)
     points *= metres_per_unit
     points[invalid] = np.nan
@@ -51,9 +51,13 @@ def clean_cloud(xyz: ArrayLike, metres_per_unit: float) -> FloatArray:
 
 
 def depth_to_metres(counts: NDArray[np.generic], metres_per_count: float) -> FloatArray:
-    """Depth (H, W) in metres from counts; zero, negative, non-finite and 65535 of 16 bits (overflow) become NaN."""
-    depth = counts.astype(np.float64) * metres_per_count
-    invalid = ~(np.isfinite(depth) & (depth > 0))
+    """Depth (H, W) in metres from counts; zero, negative, non-finite and 65535 of 16 bits (overflow) become NaN.
+
+    So does what is farther than `FARTHEST_M`: renderers write 1e10 where nothing is.
+    """
+    with np.errstate(invalid="ignore", over="ignore"):
+        depth = counts.astype(np.float64) * metres_per_count
+        invalid = ~((depth > 0) & (depth < FARTHEST_M))
     if counts.dtype.kind == "u":
         invalid |= counts == np.iinfo(np.uint16).max
     depth[invalid] = np.nan

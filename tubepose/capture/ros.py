@@ -1,30 +1,25 @@
-"""ROS 2 `sensor_msgs` as arrays: PointCloud2, Image, CompressedImage and CameraInfo."""
+"""ROS 2 `sensor_msgs` as arrays: PointCloud2, Image and CompressedImage."""
 
 from __future__ import annotations
 
 from typing import Any
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from tubepose.capture.compressed_depth import decode_compressed_depth, is_compressed_depth
 from tubepose.capture.frame import CameraIntrinsics
-from tubepose.capture.images import decode, to_picture
+from tubepose.capture.images import decode, depth_counts, to_picture
 from tubepose.capture.message_types import COMPRESSED_IMAGE
+from tubepose.capture.raw_pictures import ENCODINGS, Layout, to_colours
 from tubepose.capture.registration import depth_to_metres
 from tubepose.errors import CaptureError
 from tubepose.transforms import FloatArray
 
-# Metres per count of the two encodings that hold depth (REP 118).
-DEPTH_ENCODINGS = {"16UC1": 1.0e-3, "32FC1": 1.0}
+# The two encodings that hold depth: counts of millimetres, and metres (REP 118).
+DEPTH_ENCODINGS = ("16UC1", "32FC1")
 
 _FIELD_TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
-_PICTURES = {
-    "mono8": ("u1", 1), "8UC1": ("u1", 1), "mono16": ("u2", 1), "16UC1": ("u2", 1), "32FC1": ("f4", 1),
-    "rgb8": ("u1", 3), "bgr8": ("u1", 3), "8UC3": ("u1", 3), "rgba8": ("u1", 4), "bgra8": ("u1", 4),
-}  # fmt: skip
-_MAX_DISTORTION_PX = 1.0
 
 
 def cloud_arrays(message: Any, where: str) -> tuple[FloatArray, NDArray[np.uint8] | None]:
@@ -40,8 +35,12 @@ def cloud_arrays(message: Any, where: str) -> tuple[FloatArray, NDArray[np.uint8
         raise CaptureError(
             f"{where}: expected the fields x, y and z in a PointCloud2, found {', '.join(fields) or 'none'}"
         )
-    xyz = np.stack([_field(message, fields[axis], where).astype(np.float64) for axis in "xyz"], axis=-1)
+    with np.errstate(invalid="ignore"):  # some NaN are told of when they are cast
+        xyz = np.stack([_field(message, fields[axis], where).astype(np.float64) for axis in "xyz"], axis=-1)
     packed = fields.get("rgb") or fields.get("rgba")
+    channels = [fields[name] for name in ("red", "green", "blue") if name in fields and fields[name].datatype == 2]
+    if len(channels) == 3:
+        return xyz, np.stack([_field(message, channel, where).astype(np.uint8) for channel in channels], axis=-1)
     if packed is None or packed.datatype not in (5, 6, 7):
         return xyz, None
     colours = _field(message, packed, where, "u4").astype(np.uint32)
@@ -80,73 +79,96 @@ def _check_size(found: int, rows: int, row_bytes: int, row_step: int, where: str
 def image_array(message: Any, where: str) -> NDArray[np.generic]:
     """Pixels of an Image as stored, shape (height, width) or (height, width, channels).
 
+    Of encodings that share colours among pixels (NV12 and the like) all rows are there, those of the colours below.
+
     Raises:
         CaptureError: An encoding that is not read, or fewer bytes than it needs.
     """
-    if message.encoding not in _PICTURES:
-        known = ", ".join(_PICTURES)
-        raise CaptureError(f"{where}: image encoding '{message.encoding}' is not read; record one of {known}")
-    kind, channels = _PICTURES[message.encoding]
-    item = np.dtype((">" if message.is_bigendian else "<") + kind)
-    row_bytes = message.width * channels * item.itemsize
+    layout = _layout(message, where)
+    item = np.dtype((">" if message.is_bigendian else "<") + layout.kind)
+    rows, width = layout.rows(message.height), message.width
+    row_bytes = width * layout.channels * item.itemsize
     step = message.step or row_bytes
-    _check_size(len(message.data), message.height, row_bytes, step, where)
-    shape: tuple[int, ...] = (message.height, message.width, channels)
-    strides = (step, channels * item.itemsize, item.itemsize)
+    _check_size(len(message.data), rows, row_bytes, step, where)
+    shape: tuple[int, ...] = (rows, width, layout.channels)
+    strides = (step, layout.channels * item.itemsize, item.itemsize)
     if 0 in shape:
         raise CaptureError(f"{where}: the image is {message.width} x {message.height} pixels; expected some")
     pixels: NDArray[np.generic] = np.ndarray(shape, item, message.data, 0, strides)
-    return pixels[..., 0] if channels == 1 else pixels
+    return pixels[..., 0] if layout.channels == 1 else pixels
+
+
+def _layout(message: Any, where: str) -> Layout:
+    if message.encoding not in ENCODINGS:
+        known = ", ".join(ENCODINGS)
+        raise CaptureError(f"{where}: image encoding '{message.encoding}' is not read; record one of {known}")
+    return ENCODINGS[message.encoding]
 
 
 def picture(message: Any, schema: str, where: str) -> NDArray[np.uint8]:
-    """An Image or CompressedImage as uint8 picture, gray or RGB."""
+    """An Image or CompressedImage as uint8 picture, gray or RGB.
+
+    Raises:
+        CaptureError: An encoding that is not read, or an image that is cut or damaged.
+    """
     if schema == COMPRESSED_IMAGE:
         if is_compressed_depth(message.format):
             raise CaptureError(f"{where}: a compressed depth image is no picture; choose another --image-topic")
-        return to_picture(decode(bytes(message.data), where), bgr=True)
-    return to_picture(image_array(message, where), bgr=message.encoding.startswith("bgr") or message.encoding == "8UC3")
+        pixels = decode(bytes(message.data), where)
+        # A mosaic that was compressed as it is: 'bayer_rggb8; png compressed '.
+        coded = ENCODINGS.get(message.format.partition(";")[0].strip())
+        if coded is not None and coded.conversion is not None and pixels.ndim == 2 and coded.channels == 1:
+            return to_picture(to_colours(pixels, coded, where), bgr=False)
+        return to_picture(pixels, bgr=True)
+    layout = _layout(message, where)
+    return to_picture(to_colours(image_array(message, where), layout, where), bgr=layout.bgr)
 
 
-def depth_image(message: Any, schema: str, where: str) -> FloatArray:
+def depth_image(message: Any, schema: str, where: str, metres_per_count: float, metres_per_number: float) -> FloatArray:
     """Depth (H, W) in metres of an Image or CompressedImage that holds depth; NaN for invalid pixels.
 
+    Args:
+        message: The message.
+        schema: Its type.
+        where: Start of error messages.
+        metres_per_count: Scale of whole numbers.
+        metres_per_number: Scale of floats.
+
     Raises:
-        CaptureError: Fewer bytes than the layout needs, or compressed depth that is cut or of a kind that is not read.
+        CaptureError: Fewer bytes than the layout needs, an encoding that is no depth's, or compressed depth that is cut
+            or of a kind that is not read.
     """
     if schema == COMPRESSED_IMAGE:
-        return decode_compressed_depth(message.format, bytes(message.data), where)
-    return depth_to_metres(image_array(message, where), DEPTH_ENCODINGS[message.encoding])
+        data = bytes(message.data)
+        if is_compressed_depth(message.format):
+            return decode_compressed_depth(message.format, data, where, metres_per_count, metres_per_number)
+        pixels = depth_counts(decode(data, where), where)
+        return depth_to_metres(pixels, metres_per_number if pixels.dtype.kind == "f" else metres_per_count)
+    layout = _layout(message, where)
+    if layout.channels != 1 or layout.conversion is not None or layout.kind == "u1":
+        raise CaptureError(
+            f"{where}: expected depth as {' or '.join(DEPTH_ENCODINGS)}, found '{message.encoding}'; name the depth "
+            "with --depth-topic"
+        )
+    scale = metres_per_number if layout.kind.startswith("f") else metres_per_count
+    return depth_to_metres(image_array(message, where), scale)
 
 
-def camera_of(info: Any, *, rectified: bool) -> CameraIntrinsics | None:
-    """Pinhole intrinsics of a CameraInfo.
+def is_calibrated(info: Any) -> bool:
+    """Whether a CameraInfo holds a camera: a size, and K or P with what a camera can have (no zeros, no identity)."""
+    return any(_pinhole(info, np.asarray(rows, dtype=float).reshape(3, -1)) for rows in (info.k, info.p))
 
-    Args:
-        info: The message.
-        rectified: Whether the image is the rectified one (``image_rect``): then P holds, and no distortion is left.
 
-    Returns:
-        The intrinsics; None for an uncalibrated camera, or one whose lens moves a pixel at the border by more
-        than 1 px: such an image is no pinhole image.
-    """
-    matrix = (
-        np.array(info.p, dtype=float).reshape(3, 4)[:, :3] if rectified else np.array(info.k, dtype=float).reshape(3, 3)
+def same_camera(one: Any, other: Any) -> bool:
+    """Whether two CameraInfos say the same of the camera, whatever their stamps."""
+    return all(
+        np.array_equal(np.asarray(getattr(one, name)), np.asarray(getattr(other, name)))
+        for name in ("k", "d", "p", "r", "width", "height", "distortion_model", "binning_x", "binning_y")
+    ) and all(
+        getattr(one.roi, name) == getattr(other.roi, name) for name in ("x_offset", "y_offset", "width", "height")
     )
-    if not np.isfinite(matrix).all() or min(matrix[0, 0], matrix[1, 1], info.width, info.height) <= 0:
-        return None
-    distortion = np.array(info.d, dtype=float)
-    if not (rectified or not distortion.any() or _distortion_px(info, matrix, distortion) <= _MAX_DISTORTION_PX):
-        return None
-    (fx, _, cx), (_, fy, cy) = matrix[0].tolist(), matrix[1].tolist()
-    return CameraIntrinsics(int(info.width), int(info.height), fx, fy, cx, cy)
 
 
-def _distortion_px(info: Any, matrix: FloatArray, distortion: FloatArray) -> float:
-    """Largest shift of the image's corners and edge centres by the lens, pixels."""
-    if info.distortion_model not in ("plumb_bob", "rational_polynomial"):
-        return float("inf")
-    u, v = np.meshgrid((0, (info.width - 1) / 2, info.width - 1), (0, (info.height - 1) / 2, info.height - 1))
-    seen = np.stack([u.ravel(), v.ravel()], axis=1)
-    ideal = cv2.undistortPoints(seen[:, None], matrix, distortion, P=matrix)
-    return float(np.abs(np.asarray(ideal)[:, 0] - seen).max())
+def _pinhole(info: Any, matrix: FloatArray) -> bool:
+    numbers = (matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2])
+    return bool(np.isfinite(matrix).all()) and not CameraIntrinsics(int(info.width), int(info.height), *numbers).fault

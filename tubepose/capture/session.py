@@ -6,7 +6,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
@@ -70,6 +70,8 @@ class _SessionFile(BaseModel):
     origin: Literal["recorded", "simulated"]
     sensor: str = "unknown"
     unit: Unit | None = None
+    depth_scale_m: Annotated[float, Field(gt=0)] | None = None
+    max_stamp_difference_ms: Annotated[float, Field(ge=0)] | None = None
     topics: Topics = Topics()
     rack: str
     printed_cap: str | None = None
@@ -82,6 +84,8 @@ class Session(BaseModel):
     Attributes:
         folder: Where `session.yaml` lies.
         unit: Of the clouds' coordinates, as `open_captures` takes it.
+        depth_scale_m: Metres per count of depth images, likewise.
+        max_stamp_difference_ms: Of a picture and its cloud in recordings, likewise.
         topics: Of the recordings.
         rack: The rack of every trial.
         printed_cap: The printed cap, or None where no trial has one.
@@ -95,6 +99,8 @@ class Session(BaseModel):
     origin: Literal["recorded", "simulated"]
     sensor: str
     unit: Unit | None = None
+    depth_scale_m: float | None = None
+    max_stamp_difference_ms: float | None = None
     topics: Topics = Topics()
     rack: RackModel
     printed_cap: CapModel | None
@@ -147,6 +153,8 @@ def load_session(path: Path, average: Average = 1) -> Session:
         origin=data.origin,
         sensor=data.sensor,
         unit=data.unit,
+        depth_scale_m=data.depth_scale_m,
+        max_stamp_difference_ms=data.max_stamp_difference_ms,
         topics=data.topics,
         rack=rack,
         printed_cap=cap,

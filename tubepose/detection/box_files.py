@@ -10,6 +10,7 @@ from typing import Annotated
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, ValidationError
 
+from tubepose.detection.label_formats import picture_names, read_text
 from tubepose.errors import DetectorError
 from tubepose.transforms import FloatArray
 
@@ -52,24 +53,6 @@ class ImageBoxes:
     rows: tuple[BoxRow, ...]
 
 
-def read_class_names(path: Path) -> tuple[str, ...]:
-    """Class names of a text file, one a line, without the blanks around them.
-
-    Raises:
-        DetectorError: The file is missing or empty, or an empty line would shift the numbers.
-    """
-    names = [line.strip() for line in _read_text(path).splitlines()]
-    while names and not names[-1]:
-        names.pop()
-    if not names:
-        raise DetectorError(f"{path}: no class names; expected one name a line")
-    if "" in names:
-        raise DetectorError(
-            f"{path}:{names.index('') + 1}: found an empty line, expected a class name; remove the line"
-        )
-    return tuple(names)
-
-
 def read_yolo_txt(path: Path, n_classes: int, image_size: tuple[int, int]) -> ImageBoxes:
     """Boxes of a YOLO label file; an empty file is an image without objects.
 
@@ -82,7 +65,7 @@ def read_yolo_txt(path: Path, n_classes: int, image_size: tuple[int, int]) -> Im
         DetectorError: The file cannot be read, or a line is malformed; the message names file and line.
     """
     rows = []
-    for number, line in enumerate(_read_text(path).splitlines(), start=1):
+    for number, line in enumerate(read_text(path).splitlines(), start=1):
         if line.strip():
             rows.append(_yolo_row(line.split(), f"{path}:{number}", n_classes, image_size))
     return ImageBoxes(str(path), None, tuple(rows))
@@ -155,7 +138,7 @@ def read_coco(path: Path) -> tuple[tuple[str, ...], dict[str, list[ImageBoxes]]]
         DetectorError: The file cannot be read or is no COCO file with boxes; the message names the entry.
     """
     try:
-        data = _Coco.model_validate_json(_read_text(path))
+        data = _Coco.model_validate_json(read_text(path))
     except ValidationError as problem:
         first = problem.errors()[0]
         place = ".".join(str(part) for part in first["loc"]) or "file"
@@ -197,19 +180,10 @@ def _coco_rows(path: Path, data: _Coco) -> dict[int, list[BoxRow]]:
 
 
 def _image_keys(file_name: str) -> set[str]:
-    """Names by which an image may be looked for: without ending, with and without folders."""
+    """Names by which an image may be looked for: without ending, folders, and the marks of label tools."""
     path = PurePosixPath(file_name.replace("\\", "/").strip("/"))
     bare = path.with_suffix("") if path.name else path
     keys = {"_".join(bare.parts), bare.name, "_".join(path.parts)}
     if bare.name == "image" and len(bare.parts) > 1:
         keys |= {"_".join(bare.parts[:-1]), bare.parts[-2]}
-    return keys
-
-
-def _read_text(path: Path) -> str:
-    try:
-        return path.read_text(encoding="utf-8-sig")  # label tools on Windows write a byte order mark
-    except FileNotFoundError:
-        raise DetectorError(f"{path}: no such file") from None
-    except (OSError, UnicodeDecodeError) as problem:
-        raise DetectorError(f"{path}: cannot be read as text: {problem}") from None
+    return keys | set(picture_names(bare.name))

@@ -11,8 +11,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from tubepose.detection.box_files import read_class_names, read_yolo_txt
+from tubepose.detection.box_files import read_yolo_txt
+from tubepose.detection.label_formats import CLASS_FILES, by_picture_name, find_class_file, read_class_names
 from tubepose.errors import DetectorError
+from tubepose.labware.reading import read_yaml
 from tubepose.transforms import FloatArray
 
 _SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff")
@@ -76,8 +78,9 @@ def find_labelled(images: Path, labels: Path, classes: Path) -> LabelledFiles:
         if not folder.is_dir():
             raise DetectorError(f"{folder}: no such folder; expected a folder of {what}")
     names = read_class_names(classes)
-    found = sorted(path for path in images.iterdir() if path.suffix.lower() in _SUFFIXES and path.name[0] != ".")
-    pairs = [(path, labels / f"{path.stem}.txt") for path in found if (labels / f"{path.stem}.txt").is_file()]
+    found = _pictures(images)
+    files = by_picture_name(sorted(path for path in labels.glob("*.txt") if path.name not in CLASS_FILES))
+    pairs = [(path, label) for path in found if (label := _label_of(path, labels, files)) is not None]
     if not pairs:
         raise DetectorError(
             f"{images}: found {len(found)} pictures, but none with a label file NAME.txt in {labels}; "
@@ -86,13 +89,75 @@ def find_labelled(images: Path, labels: Path, classes: Path) -> LabelledFiles:
     return LabelledFiles(names, tuple(image for image, _ in pairs), tuple(label for _, label in pairs))
 
 
-def labelled_set(folder: Path) -> LabelledFiles:
-    """A folder with ``images/``, ``labels/`` and ``classes.txt``.
+def _pictures(folder: Path) -> list[Path]:
+    return sorted(path for path in folder.iterdir() if path.suffix.lower() in _SUFFIXES and path.name[0] != ".")
+
+
+def _label_of(picture: Path, labels: Path, files: dict[str, list[Path]]) -> Path | None:
+    """The label file of a picture: of its name, else the one that a label tool wrote for it."""
+    exact = labels / f"{picture.stem}.txt"
+    if exact.is_file():
+        return exact
+    fitting = files.get(picture.stem, [])
+    if len(fitting) > 1:
+        raise DetectorError(f"{labels}: {len(fitting)} label files fit {picture.name}; keep one of them")
+    return fitting[0] if fitting else None
+
+
+def labelled_set(place: Path) -> LabelledFiles:
+    """Pictures with labels in one of the layouts that label tools write.
+
+    A folder with ``images/`` and ``labels/``; a folder of pictures in an ``images/`` that lies beside a ``labels/``
+    with a folder of the same name (Ultralytics); a folder of pictures with their label files (Darknet); a `data.yaml`,
+    of which the ``train`` entry is taken. The class names are in it or above it, in one of `label_formats.CLASS_FILES`.
 
     Raises:
-        DetectorError: One of them is missing, or no picture has labels.
+        DetectorError: No such layout, no class names, or no picture has labels.
     """
-    return find_labelled(folder / "images", folder / "labels", folder / "classes.txt")
+    if place.suffix.lower() in (".yaml", ".yml"):
+        return _merged([_folder_set(folder, place) for folder in _train_folders(place)])
+    return _folder_set(place, None)
+
+
+def _folder_set(folder: Path, classes: Path | None) -> LabelledFiles:
+    if not folder.is_dir():
+        raise DetectorError(f"{folder}: no such folder; expected a folder of pictures with labels, or a data.yaml")
+    images, labels = _layout(folder)
+    names = classes or find_class_file(folder)
+    if names is None:
+        raise DetectorError(f"{folder}: no class names; expected one of {', '.join(CLASS_FILES)} there or above it")
+    return find_labelled(images, labels, names)
+
+
+def _layout(folder: Path) -> tuple[Path, Path]:
+    """Where the pictures of a folder lie, and where their labels."""
+    whole = folder.resolve()
+    if (folder / "images").is_dir() and _pictures(folder / "images"):
+        return folder / "images", folder / "labels"
+    if whole.name == "images":
+        return folder, whole.parent / "labels"
+    if whole.parent.name == "images":
+        return folder, whole.parent.parent / "labels" / whole.name
+    if _pictures(folder):
+        return folder, folder
+    levels = (("*/*", 0), ("*/images/*", 1), ("images/*/*", 0))
+    found = ((path, up) for pattern, up in levels for path in folder.glob(pattern))
+    parts = sorted({path.parents[up] for path, up in found if path.suffix.lower() in _SUFFIXES})
+    if parts:
+        raise DetectorError(f"{folder}: a set in parts; give one of them: {', '.join(map(str, parts[:5]))}")
+    return folder / "images", folder / "labels"
+
+
+def _train_folders(file: Path) -> list[Path]:
+    """Folders of the pictures to learn from, as Ultralytics finds them."""
+    data = read_yaml(file, DetectorError)
+    entries = data.get("train")
+    entries = entries if isinstance(entries, list) else [entries]
+    if not all(isinstance(entry, str) and entry for entry in entries):
+        raise DetectorError(f"{file}: expected 'train:' with a folder of pictures, found {str(data.get('train'))[:80]}")
+    base = file.parent / str(data.get("path") or "")
+    # Roboflow writes ../train/images for what lies beside the file.
+    return [next((p for p in (base / e, base / e.removeprefix("../")) if p.is_dir()), base / e) for e in entries]
 
 
 def labelled_sets(folders: Sequence[Path]) -> LabelledFiles:
@@ -101,7 +166,11 @@ def labelled_sets(folders: Sequence[Path]) -> LabelledFiles:
     Raises:
         DetectorError: As `labelled_set`, or the folders have different classes.
     """
-    sets = [labelled_set(folder) for folder in folders]
+    return _merged([labelled_set(folder) for folder in folders])
+
+
+def _merged(sets: Sequence[LabelledFiles]) -> LabelledFiles:
+    folders = [found.images[0].parent for found in sets]
     for folder, found in zip(folders, sets, strict=True):
         if found.classes != sets[0].classes:
             raise DetectorError(

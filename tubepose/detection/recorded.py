@@ -6,8 +6,9 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from tubepose.capture.frame import RgbdFrame
-from tubepose.detection.box_files import ImageBoxes, read_class_names, read_coco, read_yolo_txt
+from tubepose.detection.box_files import ImageBoxes, read_coco, read_yolo_txt
 from tubepose.detection.boxes import box_from_edges, class_words, image_size_px
+from tubepose.detection.label_formats import CLASS_FILES, by_picture_name, find_class_file, read_class_names
 from tubepose.detection.model import Detection, Detector
 from tubepose.errors import DetectorError
 
@@ -17,7 +18,8 @@ class RecordedDetector(Detector):
 
     For frame 2 of capture ``trial_01/original`` these names are looked for, in this order (for COCO they are compared
     with each image's file name, without its ending, with and without its folders):
-    ``trial_01_original_2``, ``original_2``, ``trial_01_original``, ``original``.
+    ``trial_01_original_2``, ``original_2``, ``trial_01_original``, ``original``; and then those as Roboflow and Label
+    Studio change them.
 
     Attributes:
         name: ``recorded``.
@@ -30,8 +32,8 @@ class RecordedDetector(Detector):
 
         Args:
             path: A COCO .json file, a folder of YOLO .txt files, or one .txt file, which is used for every frame.
-            classes: Text file with one class name a line, for YOLO files; default ``classes.txt`` beside them or in
-                the folder above.
+            classes: Class names for YOLO files: a text file with one a line, a `data.yaml` or a `notes.json`;
+                default `classes.txt`, `obj.names` or `data.yaml` beside them or in a folder above.
             class_map: From class names to the words that detections carry.
 
         Raises:
@@ -81,11 +83,13 @@ class RecordedDetector(Detector):
 
     def _default_classes(self) -> Path:
         folder = self._folder if self._folder is not None else self._path.parent
-        places = (folder / "classes.txt", folder.parent / "classes.txt")
-        for place in places:
-            if place.is_file():
-                return place
-        raise DetectorError(f"{self._path}: no class names; expected {places[0]} with one name a line, or give classes")
+        found = find_class_file(folder)
+        if found is None:
+            raise DetectorError(
+                f"{self._path}: no class names; expected {folder / CLASS_FILES[0]} with one name a line (or "
+                f"{', '.join(CLASS_FILES[1:])}), or give classes"
+            )
+        return found
 
     def _find(self, frame: RgbdFrame, size: tuple[int, int]) -> ImageBoxes:
         keys = _keys(frame)
@@ -101,10 +105,21 @@ class RecordedDetector(Detector):
             return read_yolo_txt(self._path, len(self._names), size)
         path = next((self._folder / f"{key}.txt" for key in keys if (self._folder / f"{key}.txt").is_file()), None)
         if path is None:
+            path = self._as_label_formats_name_it(keys, frame)
+        if path is None:
             looked = ", ".join(f"{key}.txt" for key in keys)
             raise DetectorError(f"{self._folder}: no boxes for {_title(frame)}; looked for {looked}")
         self._claim(str(path), frame)
         return read_yolo_txt(path, len(self._names), size)
+
+    def _as_label_formats_name_it(self, keys: list[str], frame: RgbdFrame) -> Path | None:
+        """A label file whose picture had one of these names before Roboflow or Label Studio changed it."""
+        named = by_picture_name(sorted(self._path.glob("*.txt")))
+        paths = next((named[key] for key in keys if key in named), [])
+        if len(paths) > 1:
+            told = ", ".join(path.name for path in paths[:3])
+            raise DetectorError(f"{self._path}: {len(paths)} files fit {_title(frame)} ({told}); keep one of them")
+        return paths[0] if paths else None
 
     def _claim(self, where: str, frame: RgbdFrame) -> None:
         """Refuse that ``original.txt`` silently serves the captures of two trials."""

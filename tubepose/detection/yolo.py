@@ -12,6 +12,7 @@ from tubepose.capture.frame import RgbdFrame
 from tubepose.detection.boxes import box_from_edges, class_words
 from tubepose.detection.closer_look import LEAST_TUBE_SCORE, look_twice
 from tubepose.detection.model import Detection, Detector
+from tubepose.detection.transformers import refuse_queries
 from tubepose.detection.yolo_decoding import (
     LAYOUT_SHAPES,
     LAYOUTS,
@@ -175,6 +176,8 @@ def _recognise(session: YoloSession, layout: str | None, names: tuple[str, ...] 
     index = _find_output(session.path, [output.shape for output in outputs])
     shape = outputs[index].shape
     chosen = _choose_layout(session, shape, layout, names)
+    if chosen == "final":
+        refuse_queries(session.path, outputs[index][0])
     stated = layout or (session.metadata.layout if session.metadata.layout in LAYOUTS else None)
     if chosen == "yolox" and stated is None:
         output = outputs[index][0].astype(float)

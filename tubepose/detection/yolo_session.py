@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tubepose.detection.closer_look import Looks
+from tubepose.detection.transformers import refuse_transformer
 from tubepose.errors import DetectorError
 
 _INPUT_TYPES: dict[str, type[np.floating]] = {"tensor(float)": np.float32, "tensor(float16)": np.float16}
@@ -93,6 +94,8 @@ def open_session(
     if not path.is_file():
         raise DetectorError(f"{path}: no such model file; expected an .onnx file")
     runtime = _start_runtime(path, providers, threads)
+    inputs, outputs = ([item.name for item in items] for items in (runtime.get_inputs(), runtime.get_outputs()))
+    refuse_transformer(path, inputs, outputs, runtime.get_modelmeta().custom_metadata_map)
     metadata = _read_metadata(path, runtime.get_modelmeta().custom_metadata_map)
     net_size, dtype = _read_input(path, runtime.get_inputs(), metadata, image_size)
     any_size = not any(isinstance(side, int) for side in runtime.get_inputs()[0].shape[2:])

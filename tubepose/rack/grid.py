@@ -71,7 +71,7 @@ def register_grid(
     share = max(config.rack.max_outside_share, OUTLINE_SHARE)
     config = config.model_copy(update={"rack": config.rack.model_copy(update={"max_outside_share": share})})
     found: list[tuple[RackModel, Registration]] = []
-    for T_camera_rack, rack in _racks(points_m, lattice, config):
+    for T_camera_rack, rack in coarse_racks(points_m, lattice, config):
         found.append(_grown(points_m, T_camera_rack, rack, lattice, config))
         if not found[-1][1].reason:
             break
@@ -147,7 +147,7 @@ def _with_line(
     return grown, T_camera_rack @ translation([*half_step_m, 0.0])
 
 
-def _racks(points_m: FloatArray, lattice: SlotLattice, config: Config) -> Iterator[tuple[FloatArray, RackModel]]:
+def coarse_racks(points_m: FloatArray, lattice: SlotLattice, config: Config) -> Iterator[tuple[FloatArray, RackModel]]:
     """Racks that could stand there and their coarse poses (T_camera_rack), the clearest lattice of a level first."""
     probe = lattice.rack(PROBE, PROBE)
     for level in levels(coarse_sample(points_m, config.rack_top), config.rack_top):

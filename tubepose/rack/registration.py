@@ -91,9 +91,10 @@ def _unit_suspicion(points_m: FloatArray, rack: RackModel, config: Config, metho
     for factor in plausible_unit_factors(points_m, rack):
         if method(points_m / factor, rack, config, None, None).status is RackStatus.OK:
             size = f"{factor:g} times larger" if factor > 1 else f"{1 / factor:g} times smaller"
+            unit = "--unit m or mm; " if max(factor, 1 / factor) > 100 else ""
             return (
                 f"a rack of this shape is there, but {size} than {rack.name} ({outline_words(rack)} mm): "
-                f"is the unit{' (m or mm)' if max(factor, 1 / factor) > 100 else ' or depth_scale_m'} of the capture "
-                "declared right (--unit)?"
+                f"is the unit of the capture declared right ({unit}of depth images --depth-scale, {1 / factor:g} "
+                "times the metres per count of now)?"
             )
     return ""

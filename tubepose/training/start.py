@@ -134,7 +134,7 @@ def _load_model(network: torch.nn.Module, start: Path, classes: Sequence[str]) -
 def _read_model(start: Path, classes: Sequence[str]) -> dict[str, tuple[NDArray[np.float32], NDArray[np.float32]]]:
     """Kernels and offsets of a file's convolutions, by the name of the layer that each was."""
     import onnx
-    from google.protobuf.message import DecodeError  # type: ignore[import-untyped]
+    from google.protobuf.message import DecodeError
     from onnx import numpy_helper
 
     try:
