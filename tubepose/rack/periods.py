@@ -26,8 +26,8 @@ BRIDGE_M = 18e-3
 # Sides of a face, and pitches, that racks have.
 FACE_M, PITCH_M = (0.03, 0.45), (8e-3, 60e-3)
 # A period's peak reaches at least this share of what the picture has at lag 0, about its mean; and the first of several
-# peaks is the period if it reaches this share of the best.
-LEAST_PEAK, FIRST_PEAK = 0.25, 0.8
+# peaks is the period if it reaches this share of the best, or is a half or a third of one and reaches the last share.
+LEAST_PEAK, FIRST_PEAK, PART_PEAK = 0.25, 0.8, 0.5
 # Turns about the patch's rectangle that are tried.
 TURNS_RAD = np.deg2rad(np.arange(-3.0, 3.01, 0.25))
 # An opening that fills less of its box than this is round: a disc fills 0.785 of it.
@@ -136,7 +136,14 @@ def _period(picture: NDArray[np.float64], axis: int) -> tuple[float, float] | No
     peaks = peaks[lags[peaks] > LEAST_PEAK]
     if not len(peaks):
         return None
-    period = float(peaks[np.flatnonzero(lags[peaks] >= FIRST_PEAK * lags[peaks].max())[0]])
+    high = lags[peaks] / lags[peaks].max()
+    period = float(peaks[np.flatnonzero(high >= FIRST_PEAK)[0]])
+    for part in (3, 2):
+        # Where tubes hide slots, twice the period can have the higher peak.
+        fits = peaks[(np.abs(peaks - period / part) <= 2) & (high >= PART_PEAK)]
+        if len(fits):
+            period = float(fits[0])
+            break
     height = float(lags[round(period)])
     for times in range(2, int(0.75 * len(lines) / period) + 1):
         near = np.arange(round(times * period) - 3, round(times * period) + 4)
