@@ -101,10 +101,6 @@ SENTENCES = {
         "the floor of the slots is seen {value:.1f} mm {detail} than {name} says, at most {limit:.1f} mm expected: "
         "another rack, or correct floor_mm"
     ),
-    "not_level": (
-        "it stands {value:.1f} deg off the level of the scene, at most {limit:g} deg expected, and little of its "
-        "top is seen"
-    ),
     "faces_away": (
         "the origin sees the face of {name} at {value:.0f} deg off its normal, at most {limit:g} deg expected: the "
         "origin has to be the camera; is the cloud in a robot's frame?"

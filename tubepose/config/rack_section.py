@@ -63,8 +63,6 @@ class RackConfig(Section):
             another shape fit.
         min_slot_margin: Smallest evidence, in nats, against the rack standing a slot farther.
         min_rival_ratio: Smallest ratio of the evidence of a pose to that of the next one that is accepted too.
-        max_level_deg: Where less than clear_seen is seen, the largest tilt off the level that the search found, unless
-            tops of tubes hold the rack.
         max_turn_std_deg: Largest standard deviation of a pose about any axis.
         max_shift_std_mm: Largest standard deviation of a pose along any axis.
         max_shift_std_held_mm: The same where tops of tubes hold the rack.
@@ -105,7 +103,6 @@ class RackConfig(Section):
     max_unseen_share: float = 0.4
     min_slot_margin: float = 10.0
     min_rival_ratio: float = 1.5
-    max_level_deg: float = 1.5
     max_turn_std_deg: float = 0.3
     max_shift_std_mm: float = 0.3
     max_shift_std_held_mm: float = 0.5

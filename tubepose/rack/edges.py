@@ -139,7 +139,6 @@ def best_registration(
         registration = settled(points_m, near_m, filled(rough, near_m, rack), rack, config.rack)
         if not registration.reason and _clear(registration, rack, config.rack):
             return registration
-        registration = _level(registration, hypothesis.level, config.rack)
         if not registration.reason:
             worth = max(worth, hypothesis.worth)
         if not _known(registration.fit.T_camera_rack, been, rack):
@@ -194,15 +193,6 @@ def _no_rival(
     best = max(accepted, key=lambda agreement: agreement.evidence)
     most = ROUGH_MARGIN * weight * rough_evidence(near_m, rough, best.spacing_m, rack)
     return most * config.min_rival_ratio < best.evidence
-
-
-def _level(registration: Registration, level: FloatArray, config: RackConfig) -> Registration:
-    """The same, refused where a pose that little is seen of does not stand as level as the rest of the scene."""
-    tilt_deg = float(np.rad2deg(np.arccos(min(1.0, float(registration.fit.T_camera_rack[:3, 2] @ level)))))
-    if registration.reason or registration.fit.level is not None or tilt_deg <= config.max_level_deg:
-        return registration
-    check = Check("not_level", tilt_deg, config.max_level_deg, False)
-    return replace(registration, checks=(*registration.checks, check))
 
 
 def _same(T_a: FloatArray, T_b: FloatArray, rack: RackModel) -> bool:

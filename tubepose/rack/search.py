@@ -58,14 +58,12 @@ class Hypothesis:
     Attributes:
         T_camera_rack: Array of shape (4, 4), metres.
         score: How well the coarse picture of the top explains the band, in cells of rib.
-        level: Normal of the level direction that it was found at, shape (3,).
         share: The same over all cells with points where the picture lies: 1 when all of them are ribs that agree.
     """
 
     T_camera_rack: FloatArray
     score: float
     share: float
-    level: FloatArray
 
     @property
     def worth(self) -> float:
@@ -82,14 +80,12 @@ class Band:
         solid_m: Points at the plane's height, shape (N, 2), frame of the band, metres.
         free_m: Where the lines of sight of points below cross the plane, shape (M, 2), metres.
         free_weight: How many points each of them stands for.
-        level: Normal of the level direction that it was found at, shape (3,).
     """
 
     T_camera_band: FloatArray
     solid_m: FloatArray
     free_m: FloatArray
     free_weight: float
-    level: FloatArray
 
 
 def level_directions(points_m: FloatArray, config: RackTopConfig) -> Iterator[tuple[FloatArray, FloatArray]]:
@@ -211,7 +207,7 @@ def _band(local_m: FloatArray, height: float, T_camera_level: FloatArray) -> Ban
         return None
     camera = -T_camera_band[:3, 3] @ T_camera_band[:3, :3]
     free = view_kernels.crossed(local_m[:below], below // FREE_POINTS + 1, R, center, camera)
-    return Band(T_camera_band, solid, free, max(1.0, below / FREE_POINTS), T_camera_level[:3, 2])
+    return Band(T_camera_band, solid, free, max(1.0, below / FREE_POINTS))
 
 
 def _tilt(points_m: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -336,5 +332,5 @@ def place(turn: Turn, rack: RackModel, *, tops: bool = False) -> list[Hypothesis
         score = float(match[i, j])
         around = np.abs(evidence[max(0, i - half[0]) : i + half[0] + 1, max(0, j - half[1]) : j + half[1] + 1]).sum()
         share = score / max(float(around), 1.0)
-        found.append(Hypothesis(turn.band.T_camera_band @ T_band_rack, score / full, share, turn.band.level))
+        found.append(Hypothesis(turn.band.T_camera_band @ T_band_rack, score / full, share))
     return found
