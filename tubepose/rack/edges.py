@@ -48,11 +48,13 @@ def register_edges(
     few_m = coarse_sample(points_m, config.rack_top)
     best = best_registration(points_m, few_m, levels(few_m, config.rack_top), rack, config)
     if best is not None and not best.reason:
-        best = _against_lookalikes(best, points_m, rack, config.rack)
+        best = _against_lookalikes(best, points_m, few_m, rack, config.rack)
     return pose_of(best, points_m, rack, config, hint, intrinsics)
 
 
-def _against_lookalikes(best: Registration, points_m: FloatArray, rack: RackModel, config: RackConfig) -> Registration:
+def _against_lookalikes(
+    best: Registration, points_m: FloatArray, few_m: FloatArray, rack: RackModel, config: RackConfig
+) -> Registration:
     """The same, refused where a rack of the catalogue with nearly its outline, registered there, is likelier.
 
     Where much of a face is seen, that was told in the rack's own pose already.
@@ -62,7 +64,7 @@ def _against_lookalikes(best: Registration, points_m: FloatArray, rack: RackMode
     checks = list(best.checks)
     for other in lookalikes(rack):
         T_camera_other = top_frame(best.fit.T_camera_rack, rack) @ translation([0, 0, -other.height_m])
-        gain = likelihood_at(points_m, T_camera_other, other, config) - best.log_likelihood
+        gain = likelihood_at(points_m, few_m, T_camera_other, other, config) - best.log_likelihood
         if np.isfinite(gain):
             checks.append(Check("other_rack", gain, config.max_gain, gain <= config.max_gain, detail=other.name))
     return replace(best, checks=tuple(checks))

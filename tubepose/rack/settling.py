@@ -13,7 +13,7 @@ from tubepose.labware import RackModel
 from tubepose.rack.agreement import Agreement, coverage, measure_agreement
 from tubepose.rack.alternatives import own_distance_m
 from tubepose.rack.fit import HOPELESS_SHARE, Fit, RoughFit, at_the_top, leveled, refine, top_frame
-from tubepose.rack.looks import SLOT_STEPS, look_at, on_lattice
+from tubepose.rack.looks import SLOT_STEPS, look_at, on_lattice, seen_near
 from tubepose.rack.proof import face_of, prove, quick_checks
 from tubepose.rack.size import FaceSize
 from tubepose.rack.tops import Level, level_by_tops
@@ -135,14 +135,18 @@ def _proved(registration: Registration, near_m: FloatArray, rack: RackModel, con
     )  # fmt: skip
 
 
-def likelihood_at(points_m: FloatArray, T_camera_rack: FloatArray, rack: RackModel, config: RackConfig) -> float:
+def likelihood_at(
+    points_m: FloatArray, few_m: FloatArray, T_camera_rack: FloatArray, rack: RackModel, config: RackConfig
+) -> float:
     """Log likelihood of the cells of a rack's face, registered from a coarse pose, nats.
 
-    Minus infinity where it does not fit. Arguments are those of `register_at`.
+    Minus infinity where it does not fit. Arguments are those of `register_at`, and some of the points, (M, 3), that it
+    is registered by: an edge is known better by them than cells are wide.
     """
-    near_m, rough = on_lattice(points_m, T_camera_rack, rack)
+    near_m, rough = on_lattice(few_m, T_camera_rack, rack)
     best = _judged(near_m, rough, rack, config)
     if best.reason:
         return float("-inf")
+    near_m = seen_near(points_m, best.fit.T_camera_rack, rack)
     face = face_of(best.fit.laid_flat(near_m, rack), best.fit, best.agreement.spacing_m, rack)
     return face.log_likelihood(own_distance_m(rack, face.grid))
