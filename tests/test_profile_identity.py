@@ -9,7 +9,7 @@ import scenes
 
 from tubepose.config import Config, ProfileConfig
 from tubepose.labware import TubeModel, load_rack, load_tube
-from tubepose.profile.closed_tops import higher_share
+from tubepose.profile.closed_tops import filled_share, higher_share
 from tubepose.profile.identity import Radii, measured_radii, name_tops
 from tubepose.profile.measure import measure_tops
 from tubepose.profile.tops import top_level_m, top_radius_m
@@ -186,3 +186,16 @@ def test_a_height_alone_does_not_tell_a_type():
     radii = Radii(np.array([np.nan]), np.array([FIT_M]), 1e-4)
     found = name_tops(np.array([top_level_m(WIDE, RACK)]), radii, np.array([[True]]), RACK, [WIDE], CONFIG)
     assert 0 < found.odds[0] < CONFIG.min_type_odds
+
+
+def test_an_open_rim_has_nothing_in_its_mouth(frame):
+    """A closed cap that is taken for an open tube's rim of its height is told by what fills it."""
+    level_mm = WIDE.height_mm - OPEN.height_mm
+    rim = OPEN.model_copy(update={"name": "rim", "body": OPEN.body.model_copy(
+        update={"height_mm": OPEN.body.height_mm + level_mm, "top_diameter_mm": WIDE.cap.diameter_mm}
+    )})  # fmt: skip
+    tubes = [WIDE, NARROW, LOW]
+    found = measure_tops(frame, frame.intrinsics, VIEW, RACK, tubes, Config())
+    assert np.isnan(filled_share(found, tubes, RACK)).all()
+    taken = replace(found, tops=replace(found.tops, tube=np.zeros_like(found.tops.tube)))
+    assert np.all(filled_share(taken, [rim], RACK) > 0.9)

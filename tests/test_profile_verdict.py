@@ -11,7 +11,7 @@ from tubepose.profile.verdict import p_type, tube_checks
 CONFIG = ProfileConfig()
 RACK = load_rack("chen2023-soft-5x10")
 TUBE = load_tube("chen2023-tube-2")
-GOOD = {"sectors": 0.9, "allowed": 0.7, "higher": 0.05, "high_m": 2e-4, "tilt_std_rad": 0.003}
+GOOD = {"sectors": 0.9, "allowed": 0.7, "higher": 0.05, "filled": 0.1, "high_m": 2e-4, "tilt_std_rad": 0.003}
 
 
 def checks(**changed):
@@ -39,6 +39,7 @@ def test_a_good_tube_passes_every_check():
         ({"high_m": 5e-3}, "height_off", 5.0, "+5.0 mm off the height of chen2023-tube-2 in chen2023-soft-5x10"),
         ({"high_m": -1.3e-3}, "height_off", -1.3, "-1.3 mm off"),
         ({"higher": 0.4}, "something_higher", 40, "something taller stands there"),
+        ({"filled": 0.8}, "mouth_filled", 80, "a closed top"),
         ({"allowed": 1e-5}, "not_in_slot", 1e-5, "slot C5 of chen2023-soft-5x10 does not let it"),
         ({"tilt_std_rad": np.deg2rad(0.75)}, "tilt_uncertain", 0.75, "known to 0.75 deg only"),
         ({"runner_up": 0.95}, "type_unclear", 95, "as well as chen2023-tube-2 (95%"),

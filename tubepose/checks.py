@@ -159,6 +159,10 @@ SENTENCES = {
         "{value:.0f}% of the points over its top lie above it, at most {limit:.0f}% expected: something taller stands "
         "there"
     ),
+    "mouth_filled": (
+        "{value:.0f}% of the points in its mouth lie at one height near its rim, at most {limit:.0f}% expected: a "
+        "closed top, of another type"
+    ),
     "not_in_slot": "stands or leans as slot {detail} does not let it: jammed, on something, or not in the slot",
     "tilt_uncertain": (
         "its tilt is known to {value:.2f} deg only (standard deviation), at most {limit:.2f} deg expected"

@@ -45,6 +45,8 @@ class ProfileConfig(Section):
         min_allowed: Least share of what the measurements leave open that the slot must allow.
         max_higher: Largest share of the points over a top's middle that lie above it: ghosts in clear tubes
             are a sixth at most.
+        max_filled: Largest share of the points in an open tube's mouth that lie at one height near its rim.
+            Ghosts in clear tubes are a sixth at most.
         max_runner_up: A type whose top another one fits with this share of its support is not told apart.
         max_height_error_m: A closed top farther off its height than this is rejected: four times `cap_height_m`. It
             grows with the noise of heights as that standard deviation does.
@@ -86,6 +88,7 @@ class ProfileConfig(Section):
     slot_tolerance_m: float = 1.0e-4
     min_allowed: float = 1.0e-3
     max_higher: float = Field(default=0.3, gt=0)
+    max_filled: float = Field(default=0.5, gt=0)
     max_height_error_m: float = 1.2e-3
     max_runner_up: float = 0.9
     max_tilt_std_rad: float = 0.0105

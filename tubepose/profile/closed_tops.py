@@ -35,8 +35,11 @@ looked for there, so often at most."""
 
 MIDDLE_SHARE, MIDDLE_POINTS = 0.6, 20
 """The middle of a top, as a share of its radius, and how many points it has at least to tell what lies above it."""
-HIGHER_M = 2.0e-3
-"""What lies this far above a top is not of it: what a wrong pose is, more than a lean or noise make."""
+HIGHER_M, ONE_HEIGHT_M = 2.0e-3, 2.0e-3
+"""What lies this far above a top is not of it: what a wrong pose is, more than a lean or noise make. What is of one top
+lies within the other."""
+DEEP_M = 4.0e-3
+"""Nothing fills a tube up to this far below its rim: what lies there is a closed top that was taken for a rim."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -202,21 +205,27 @@ def higher_share(measured: Measured, tubes: Sequence[TubeModel], rack: RackModel
 
     A top is the highest thing over its slot. What is higher and no ghost lies at one height: the fullest two
     millimetres count.
-
-    Args:
-        measured: The tops, T of them.
-        tubes: The candidate types.
-        rack: The rack.
     """
+    return _share_above(measured, top_shapes(measured.tops, tubes, rack).radius_m, HIGHER_M)
+
+
+def filled_share(measured: Measured, tubes: Sequence[TubeModel], rack: RackModel) -> FloatArray:
+    """Share of the points in the mouth of every open top that are of a closed one, shape (T,); NaN of closed tops.
+
+    A mouth is open: what lies in it lies deep. The fullest two millimetres above `DEEP_M` below the rim count.
+    """
+    shape = top_shapes(measured.tops, tubes, rack)
+    return np.where(shape.open, _share_above(measured, np.where(shape.open, shape.mouth_m, 0.0), -DEEP_M), np.nan)
+
+
+def _share_above(measured: Measured, radius_m: FloatArray, above_m: float) -> FloatArray:
+    """Share of the points over the middle of discs (T,) that lie at one height, so much above their tops or higher."""
     count = len(measured.level_m)
-    if count == 0:
-        return np.zeros(0)
     rows = np.flatnonzero(measured.label >= 0)
     of, points_m = measured.label[rows], measured.points.points_m[rows]
-    radius_m = top_shapes(measured.tops, tubes, rack).radius_m
     near = np.hypot(*(points_m[:, :2] - measured.center_m[of]).T) < MIDDLE_SHARE * radius_m[of]
     of = of[near]
-    bins = np.ceil((points_m[near, 2] - measured.level_m[of] - HIGHER_M) / (HIGHER_M / 2)).astype(np.intp)
+    bins = np.ceil((points_m[near, 2] - measured.level_m[of] - above_m) / (ONE_HEIGHT_M / 2)).astype(np.intp)
     higher, width = bins > 0, max(int(bins.max(initial=0)), 1) + 2
     inside = np.bincount(of, minlength=count)
     counts = np.bincount(of[higher] * width + bins[higher], minlength=count * width).reshape(count, width)

@@ -15,7 +15,7 @@ from tubepose.config import Config, ProfileConfig
 from tubepose.labware import RackModel, TubeModel
 from tubepose.preprocessing import TALLEST_TUBE_M
 from tubepose.profile.bowed import FaceBow, SlotFrame, in_rack_frame, slot_frame
-from tubepose.profile.closed_tops import Measured, higher_share, top_measures
+from tubepose.profile.closed_tops import Measured, filled_share, higher_share, top_measures
 from tubepose.profile.floor import SETTLED_MM, settle_floor
 from tubepose.profile.fusing import fuse, pose_covariance, rise_m
 from tubepose.profile.kernels import grouped
@@ -190,8 +190,8 @@ def _fit_part(part: _Part, tubes: Sequence[TubeModel], noise: SensorNoise, confi
     rise = rise_m(measured, models, rack, config, top_noise)
     clouds = _clouds(measured, len(models))
     found = []
-    higher = higher_share(measured, tubes, rack)
-    poses = _poses(measured, posterior, covariance, rise, clouds, models, rack, config, top_noise, higher)
+    middles = (higher_share(measured, tubes, rack), filled_share(measured, tubes, rack))
+    poses = _poses(measured, posterior, covariance, rise, clouds, models, rack, config, top_noise, middles)
     for i, (tube, pose) in enumerate(zip(models, poses, strict=True)):
         slot = rack.all_slots[measured.tops.slot[i]]
         crowd = next((left.reason for left in leftovers if left.slot == measured.tops.slot[i]), "")
@@ -228,7 +228,7 @@ def _poses(
     rack: RackModel,
     config: ProfileConfig,
     noise: TopNoise,
-    higher: FloatArray,
+    middles: tuple[FloatArray, FloatArray],
 ) -> list[TubePose]:
     """Pose and verdict of every tube."""
     tops, circles = measured.tops, measured.circles
@@ -244,7 +244,8 @@ def _poses(
     verdicts = {
         "sectors": circles.sectors,
         "allowed": posterior.allowed,
-        "higher": higher,
+        "higher": middles[0],
+        "filled": middles[1],
         "high_m": measured.planes.height_m - rack.floor_m - height,
         "tilt_std_rad": tilt_std,
         "looked_at": (is_open == 0) | np.isfinite(circles.widening_m),

@@ -23,6 +23,7 @@ def tube_checks(
     sectors: float,
     allowed: float,
     higher: float,
+    filled: float,
     high_m: float,
     tilt_std_rad: float,
     tube: TubeModel,
@@ -39,6 +40,7 @@ def tube_checks(
         sectors: Share of the top's circle that was seen.
         allowed: Share of what the measurements leave open that the slot allows.
         higher: Share of the points over its top's middle that lie above it.
+        filled: Share of the points in its mouth that lie at one height near its rim; NaN of a closed top.
         high_m: Height of a closed top above where it should be, metres; NaN for an open one.
         tilt_std_rad: Standard deviation of the tilt.
         tube: Its type.
@@ -65,6 +67,8 @@ def tube_checks(
             most_m = config.max_height_error_m
             yield Check("height_off", 1e3 * high_m, 1e3 * most_m, abs(high_m) <= most_m, detail=rack.name)
         yield Check("something_higher", 100 * higher, 100 * config.max_higher, higher <= config.max_higher)
+        if np.isfinite(filled):
+            yield Check("mouth_filled", 100 * filled, 100 * config.max_filled, filled <= config.max_filled)
         where = f"{slot} of {rack.name}"
         yield Check("not_in_slot", allowed, config.min_allowed, allowed >= config.min_allowed, detail=where)
         std_deg, limit_deg = np.rad2deg(tilt_std_rad), np.rad2deg(config.max_tilt_std_rad)
