@@ -11,7 +11,8 @@ WRONG is: a rack `ok` under another name, or more than 2 mm or 2 deg off at the 
 marked ambiguous counts as right either way); a slot called empty that holds a tube, or occupied that holds none; a tube
 `ok` of another type, under another slot's name, or more than 2 mm or 2 deg off across its axis, or more than 2 mm along
 it where it wears a closed cap. Open tubes off along their axes are counted apart: no capture shows their floor.
-A rack whose scale is marked as off or unknown is not wrong along the line of sight, nor are its tubes.
+A rack whose scale is marked as off or unknown is not wrong along the line of sight, nor are its tubes; where its pitch
+is marked, tubes are not wrong across their axes.
 --out gets answers.csv, one row per frame and case, and table.md.
 """
 

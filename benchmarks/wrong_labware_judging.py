@@ -170,6 +170,8 @@ def judge(truth: Truth, answer: Answer, same_rack: bool, face_truth: Truth | Non
 
 SCALE_MARKS = frozenset(("scale", "scale_unknown"))
 """Marks that say that an accepted rack is off along the line of sight, or that nobody can tell."""
+PITCH_MARKS = frozenset(("pitch_x", "pitch_y"))
+"""Marks that say that slots are not where the rack's file has them."""
 _NO_TURN: FloatArray = np.eye(4)
 
 
@@ -243,7 +245,7 @@ def _tube_verdicts(truth: Truth, answer: Answer) -> Iterator[Verdict]:
         faults = (
             int(stated.type_name != nearest.model.name),
             int(stated.slot != nearest.slot),
-            int(across > WRONG_M),
+            int(across > WRONG_M and not answer.marks & PITCH_MARKS),
             int(angle > WRONG_RAD),
             int(far and shown),
         )

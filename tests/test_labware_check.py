@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tubepose.checks import Check
+from tubepose.checks import Check, mark_codes
 from tubepose.config import Config
 from tubepose.labware import load_rack, load_tube
 from tubepose.labware_check import (
@@ -186,7 +186,7 @@ def test_tubes_that_only_lean_refuse_nothing(seed):
     scene, after = refuse_by_tops(before, tubes, CONFIG)
     assert scene.rack_pose.status is RackStatus.OK
     assert after == tubes
-    assert [check.code for check in scene.rack_pose.checks] == ["pitch_x", "pitch_y"]
+    assert [check.code for check in scene.rack_pose.checks if check.decides] == ["pitch_x", "pitch_y"]
 
 
 def test_few_tubes_tell_no_pitch_and_a_given_pose_is_not_asked():
@@ -197,7 +197,14 @@ def test_few_tubes_tell_no_pitch_and_a_given_pose_is_not_asked():
     # One row of tubes says nothing of the other axis.
     row = [slot for slot in RACK.all_slots if slot.name.startswith("A")]
     scene, _ = refuse_by_tops(a_scene(UNSEEN), stretched((0.0, 0.0), row), CONFIG)
-    assert [check.code for check in scene.rack_pose.checks] == ["pitch_x"]
+    assert [check.code for check in scene.rack_pose.checks if check.decides] == ["pitch_x"]
+
+
+@pytest.mark.parametrize(("stretch", "marks"), [(0.0, set()), (0.009, {"pitch_x"})])
+def test_a_pitch_that_is_off_but_not_by_enough_to_refuse_is_marked(stretch, marks):
+    scene, _ = refuse_by_tops(a_scene(UNSEEN), stretched((stretch, 0.0), scatter_mm=0.1), CONFIG)
+    assert scene.rack_pose.status is RackStatus.OK
+    assert set(filter(None, mark_codes(scene.rack_pose.checks).split(";"))) == marks
 
 
 # Which racks

@@ -8,10 +8,11 @@ from dataclasses import replace
 import numpy as np
 from scipy.stats import norm, t
 
-from tubepose.checks import Check, reason, said, sentence
+from tubepose.checks import Check, failed, reason, said, sentence
 from tubepose.config import Config, RackConfig
 from tubepose.labware import RackModel
 from tubepose.rack import RackPose, RackStatus
+from tubepose.rack.proof import pitch_checks
 from tubepose.scene import Scene, TubeEstimate
 from tubepose.statistics import weighted_mean
 from tubepose.tube import TubeStatus
@@ -45,7 +46,7 @@ def refuse_by_tops(
     if pose.T_camera_rack is None or pose.resolved_by == "given":
         return scene, tuple(estimates)
     checks = tuple(_pitch_checks(pose, rack, estimates, config.rack))
-    wrong = [check for check in checks if not check.passed]
+    wrong = failed(checks)
     pose = replace(pose, checks=(*pose.checks, *checks))
     if not wrong:
         return replace(scene, rack_pose=pose), tuple(estimates)
@@ -75,10 +76,8 @@ def _pitch_checks(
         if tops is None:
             continue
         share, std = joined(ribs_stretch(pose, axis), tops)
-        off_mm = float(share * reach_mm[axis])
-        passed = abs(off_mm) - SIGMAS * std * reach_mm[axis] <= config.max_pitch_mm
-        words = "farther apart" if off_mm > 0 else "nearer"
-        yield Check(f"pitch_{name}", abs(off_mm), config.max_pitch_mm, bool(passed), detail=words)
+        off_mm, std_mm = float(share * reach_mm[axis]), float(std * reach_mm[axis])
+        yield from pitch_checks(f"pitch_{name}", off_mm, std_mm, config)
 
 
 def ribs_stretch(pose: RackPose, axis: int) -> tuple[float, float] | None:

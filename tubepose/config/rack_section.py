@@ -41,6 +41,8 @@ class RackConfig(Section):
             files give.
         max_pitch_mm: How far the outermost slots may lie from where the rack's file has them, because of another pitch;
             beyond three standard deviations of its measurement, as with those below. Half of what a wrong answer is.
+        max_pitch_marked_mm: The same, from where on it is marked, beyond two standard deviations: a quarter of what a
+            wrong answer is.
         max_openings_mm: How much wider or narrower openings may be: blur moves their edges by up to 0.6 mm each.
         max_outline_mm: How much larger or smaller the outline may be.
         max_scale: Largest difference of scale, as a share, of everything that is seen of the rack.
@@ -87,6 +89,7 @@ class RackConfig(Section):
     max_outside_share: float = 0.01
     max_gain: float = 60.0
     max_pitch_mm: float = 1.0
+    max_pitch_marked_mm: float = Field(default=0.5, gt=0)
     max_openings_mm: float = 2.0
     max_outline_mm: float = 6.0
     max_scale: float = 0.0075

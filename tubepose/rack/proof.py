@@ -40,6 +40,8 @@ FLOOR_SAMPLE = 60_000
 FLAT_M = 0.8e-3
 WALL_M = 2.5e-3
 DEEP_M = 6e-3
+# A size that differs by so many standard deviations is marked: one right file of twenty may have it.
+MARKS_SIGMAS = 2.0
 # Slots that have to agree on it, and how well the level of one is known.
 FLOOR_SLOTS = 3
 FLOOR_STD_M = 0.3e-3
@@ -161,12 +163,28 @@ def _sizes(size: FaceSize, rack: RackModel, config: RackConfig) -> Iterator[Chec
     std, reach_m = size.std, np.abs(rack.slot_centers_m).max(axis=0)
     for axis, name in enumerate("xy"):
         value_mm, std_mm = (1e3 * float(share * reach_m[axis]) for share in (size.stretch[axis], std[axis]))
-        yield from _measured(f"pitch_{name}", value_mm, std_mm, config.max_pitch_mm, ("farther apart", "nearer"))
+        yield from pitch_checks(f"pitch_{name}", value_mm, std_mm, config)
     wider_m, wider_std_m = size.wider_openings_m()
     yield from _measured("openings", 2e3 * wider_m, 2e3 * wider_std_m, config.max_openings_mm, ("wider", "narrower"))
     for axis in range(2):
         value_mm, std_mm = (2e3 * float(value) for value in (size.outline_m[axis], std[3 + axis]))
         yield from _measured("outline", value_mm, std_mm, config.max_outline_mm, ("larger", "smaller"))
+
+
+def pitch_checks(code: str, value_mm: float, std_mm: float, config: RackConfig) -> Iterator[Check]:
+    """What another distance of slots refuses, beyond three standard deviations, and what it marks, beyond two.
+
+    Args:
+        code: Of the axis.
+        value_mm: How much farther out the outermost slots lie than the rack's file has them.
+        std_mm: Its standard deviation.
+        config: Limits.
+    """
+    words = "farther apart" if value_mm > 0 else "nearer"
+    most_mm = config.max_pitch_marked_mm
+    marked = abs(value_mm) > max(MARKS_SIGMAS * std_mm, most_mm)
+    yield Check(code, abs(value_mm), most_mm, not marked, decides=False, detail=words)
+    yield from _measured(code, value_mm, std_mm, config.max_pitch_mm, ("farther apart", "nearer"))
 
 
 def _measured(code: str, value: float, std: float, limit: float, words: tuple[str, str]) -> Iterator[Check]:
@@ -184,8 +202,7 @@ def _scale(size: FaceSize, rack: RackModel, distance_m: float, config: RackConfi
     scale, std = size.scale(rack, config.edge_std_mm * 1e-3)
     words = "larger" if scale > 0 else "smaller"
     moved_mm = 1e3 * abs(scale) * distance_m
-    # A mark costs little: one right file of twenty may have it.
-    significant = abs(scale) > 2 * std and moved_mm > config.max_scale_shift_mm
+    significant = abs(scale) > MARKS_SIGMAS * std and moved_mm > config.max_scale_shift_mm
     yield Check("scale", 100 * abs(scale), 0.1 * config.max_scale_shift_mm / distance_m, not significant, False, words)
     unknown_mm, most_mm = 3e3 * distance_m / float(np.hypot(1 / std, 1 / config.scale_std)), config.max_scale_unknown_mm
     yield Check("scale_unknown", unknown_mm, most_mm, unknown_mm <= most_mm, decides=False)
