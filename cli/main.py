@@ -12,6 +12,7 @@ from tubepose.errors import StoppedError, TubePoseError, is_interrupt
 from tubepose_cli import data, detector, labware
 from tubepose_cli.bench import bench
 from tubepose_cli.estimate import estimate
+from tubepose_cli.evaluate import evaluate
 from tubepose_cli.gt import gt
 from tubepose_cli.measure import measure
 from tubepose_cli.sensor import sensor
@@ -24,7 +25,7 @@ app = typer.Typer(
     add_completion=False,
     pretty_exceptions_enable=False,
 )
-for _command in (estimate, gt, bench, simulate, sensor):
+for _command in (estimate, gt, bench, evaluate, simulate, sensor):
     app.command()(_command)
 labware.app.command()(measure)
 app.add_typer(labware.app, name="labware")
