@@ -4,11 +4,16 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from tubepose_cli.paths import named
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from tubepose.evaluation import GateResult
 
 ALL_METHODS = "upright,profile,paper,slot-icp,global-icp"
 
@@ -48,6 +53,20 @@ def bench(
         str | None,
         typer.Option(metavar="N|all", help="Fuse so many frames of a static recording, or all, into one."),
     ] = None,
+    baseline: Annotated[
+        Path | None, typer.Option(help="Run to be gated by: a baseline file, or the folder of a run.")
+    ] = None,
+    fail_if: Annotated[
+        str | None, typer.Option("--fail-if", help="Gates with commas: kept,wrong,error,coverage,time:1.2.")
+    ] = None,
+    write_baseline_to: Annotated[
+        Path | None, typer.Option("--write-baseline", help="Write this run as a baseline file.")
+    ] = None,
+    junit: Annotated[Path | None, typer.Option(help="Write the gates as JUnit XML.")] = None,
+    summary_json: Annotated[Path | None, typer.Option("--summary-json", help="Write counts and gates as JSON.")] = None,
+    other_data: Annotated[
+        bool, typer.Option("--other-data", help="Gate though data, labware or versions differ from the baseline's.")
+    ] = False,
     fail_fast: Annotated[bool, typer.Option("--fail-fast", help="Stop at the first bad capture.")] = False,
 ) -> None:
     """Run every method on sessions, compare with the ground truth, and print the paper's two tables.
@@ -58,10 +77,13 @@ def bench(
     from tubepose.benchmark import BenchOptions, judge_run, plan_bench
     from tubepose.capture.fusion import read_average
     from tubepose.config import load_config
+    from tubepose_cli.gating import GateOptions, finish_gates, gate_bench, read_asked
     from tubepose_cli.inputs import find_sessions, make_detector, read_methods, sample_session, used_model
     from tubepose_cli.results import run_estimates
     from tubepose_cli.show import finish, progress, say, show_table
 
+    gate_options = GateOptions(baseline, fail_if, write_baseline_to, junit, summary_json, other_data)
+    asked = read_asked(gate_options)
     settings = load_config(config)
     options = BenchOptions(
         read_methods(methods), seeds, exact_truth, known_rack, all_tubes, published, fail_fast,
@@ -74,6 +96,7 @@ def bench(
     problems = list(dict.fromkeys([*problems, *plan.problems]))
     if not measured.sessions:
         finish(problems)  # before anything of an earlier run is written over
+    gates: Sequence[GateResult] = ()
     tables = run_estimates(
         plan.jobs, options.methods, detector_for, settings, out, sys.argv, seeds=seeds, overlays=overlays,
         fail_fast=fail_fast, warm_up=True, inputs=[
@@ -89,6 +112,10 @@ def bench(
         for table in found.tables.values():
             show_table(table.cells, table.caption, table.notes)
         say(f"all tables and rows: {out}")
+        gates = gate_bench(out, found, asked, gate_options)
+    elif asked.gates:
+        problems.append("no trial could be judged, so no gate is passed")
     elif not exact_truth:
         say("no trial has a capture with printed caps that could be measured: no errors, no tables")
     finish([*problems, *tables.problems])
+    finish_gates(gates)

@@ -44,7 +44,9 @@ def gt(
     if not measured.sessions:
         finish(problems)
     caps = [session.printed_cap for session in measured.sessions if session.printed_cap is not None]
-    labware: list[Labware] = [item for session in measured.sessions for item in (session.rack, *session.tubes.values())]
+    labware: list[Labware] = []
+    for session in measured.sessions:
+        labware += [session.rack, *session.tubes.values()]
     record = run_record(
         sys.argv, Config(), [*labware, *caps], used, problems=problems, ground_truth_config=measured.config
     )

@@ -11,6 +11,7 @@ from tubepose import __version__
 from tubepose.errors import StoppedError, TubePoseError, is_interrupt
 from tubepose_cli import data, detector, labware
 from tubepose_cli.bench import bench
+from tubepose_cli.compare import compare
 from tubepose_cli.estimate import estimate
 from tubepose_cli.evaluate import evaluate
 from tubepose_cli.gt import gt
@@ -25,7 +26,7 @@ app = typer.Typer(
     add_completion=False,
     pretty_exceptions_enable=False,
 )
-for _command in (estimate, gt, bench, evaluate, simulate, sensor):
+for _command in (estimate, gt, bench, evaluate, compare, simulate, sensor):
     app.command()(_command)
 labware.app.command()(measure)
 app.add_typer(labware.app, name="labware")

@@ -12,22 +12,34 @@ from tubepose.benchmark.plan import (
     judge_run,
     plan_bench,
 )
+from tubepose.benchmark.runs import Run, fingerprint, read_run, tube_times_ms, write_baseline
+from tubepose.benchmark.verdict import Comparison, compare, gate_alone, gate_table, junit_xml
 
 __all__ = [
     "BENCH_METHODS",
     "Bench",
     "BenchOptions",
     "BenchPlan",
+    "Comparison",
     "EvaluateOptions",
     "Evaluation",
     "Judgement",
     "MeasuredTruth",
+    "Run",
     "bench",
+    "compare",
     "count_lines",
     "evaluate",
+    "fingerprint",
+    "gate_alone",
+    "gate_table",
     "judge",
     "judge_run",
+    "junit_xml",
     "measure_sessions",
     "plan_bench",
+    "read_run",
+    "tube_times_ms",
+    "write_baseline",
     "write_tables",
 ]
