@@ -20,6 +20,7 @@ from tubepose_cli.measure import measure
 from tubepose_cli.repeat import repeat
 from tubepose_cli.sensor import sensor
 from tubepose_cli.simulate import simulate
+from tubepose_cli.slots import slots
 
 app = typer.Typer(
     name="tubepose",
@@ -28,7 +29,7 @@ app = typer.Typer(
     add_completion=False,
     pretty_exceptions_enable=False,
 )
-for _command in (estimate, gt, bench, evaluate, compare, export_bop, repeat, simulate, sensor):
+for _command in (estimate, gt, bench, evaluate, compare, export_bop, repeat, slots, simulate, sensor):
     app.command()(_command)
 labware.app.command()(measure)
 app.add_typer(labware.app, name="labware")

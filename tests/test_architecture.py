@@ -116,7 +116,7 @@ ALLOWED: dict[str, set[str]] = {
         "pose_errors",
         "simulation",
     },
-    "foreign": {"labware", "pose_errors", "records", "simulation", "truth_tables"},
+    "foreign": {"capture", "labware", "pose_errors", "records", "simulation", "truth_tables"},
     "benchmark": {
         "batch",
         "capture",
