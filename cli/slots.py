@@ -123,7 +123,7 @@ def _differences(found: pd.DataFrame, allowed: set[str]) -> list[str]:
         capture, finding = map(str, key)
         if finding != "ok" and finding not in allowed:
             lines.append(f"{capture}: {len(rows)} {finding.replace('_', ' ')}: {', '.join(rows['slot'])}")
-    for capture, rows in found.groupby("capture", sort=False):
+    for name, rows in found.groupby("capture", sort=False):
         if rows["ambiguous"].astype(bool).any():
-            lines.append(f"{capture}: the rack may stand another way round, so that slot names may be swapped")
+            lines.append(f"{name!s}: the rack may stand another way round, so that slot names may be swapped")
     return lines

@@ -67,6 +67,13 @@ def test_errors_a_twentieth_larger_are_caught() -> None:
     assert failed(worse, errors()) == set()
 
 
+def test_the_digits_of_a_baseline_file_are_no_change() -> None:
+    rounded = errors()
+    for name in ("tilt_deg", "cap_mm", "lateral_mm", "axial_mm", "mahalanobis2"):
+        rounded[name] *= 1 - 2e-6
+    assert failed(rounded, errors()) == set()
+
+
 def test_answering_less_is_caught_though_the_means_are_better() -> None:
     before = errors(captures=80)
     assert failed(before, drop(before, 0.02)) == {"kept"}

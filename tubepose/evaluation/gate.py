@@ -23,6 +23,8 @@ LEAST_CAPTURES = 8
 INSIDE_95_RANGE = (0.92, 0.98)
 GATED_ERRORS = ("tilt_deg", "cap_mm", "axial_mm")
 _TESTS = 3 + len(GATED_ERRORS)
+_ROUNDING = 1e-5
+"""Relative changes below it are those of a baseline file's digits, and count as none."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -168,7 +170,8 @@ def _error_gate(pairs: pd.DataFrame, method: str, name: str) -> GateResult:
     if not len(both):
         return GateResult(f"error {name}", method, True, "-", "-", "no tube is answered in both")
     groups = captures_of(both)
-    found, p = paired_bootstrap(after - before, groups), sign_flip_p(after - before, groups)
+    change = np.where(np.abs(after - before) <= _ROUNDING * np.maximum(before, after), 0.0, after - before)
+    found, p = paired_bootstrap(change, groups), sign_flip_p(change, groups)
     beyond = found.low > 0 if found.n_groups > 1 else found.mean > 0
     failed = beyond and (p < _limit() or found.n_groups < LEAST_CAPTURES)
     words = f"mean change {found.mean:+.4f} [{found.low:+.4f}, {found.high:+.4f}] over {found.n} tubes, p = {p:.2g}"
@@ -191,7 +194,8 @@ def _coverage_gate(errors: pd.DataFrame, method: str, pairs: pd.DataFrame | None
             subset=["mahalanobis2_before", "mahalanobis2_after"]
         )
         grown = np.log(both["mahalanobis2_after"].to_numpy(float)) - np.log(both["mahalanobis2_before"].to_numpy(float))
-        p = sign_flip_p(np.nan_to_num(grown, posinf=0.0, neginf=0.0), captures_of(both)) if len(both) else 1.0
+        grown = np.where(np.isfinite(grown) & (np.abs(grown) > _ROUNDING), grown, 0.0)
+        p = sign_flip_p(grown, captures_of(both)) if len(both) else 1.0
         if p < _limit() and found.mean < high:
             meets = False
             words = f"{words}; seen over stated errors grew by {np.exp(np.median(grown) / 2) - 1:.1%}, p = {p:.2g}"
