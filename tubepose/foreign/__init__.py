@@ -1,8 +1,8 @@
 """Results of other estimators as rows of estimates.csv: our own columns, BOP results, trajectories, JSON."""
 
 from tubepose.foreign.bop_results import read_bop_results, write_bop_results
+from tubepose.foreign.foreign_rows import read_estimates, read_truth
 from tubepose.foreign.mapping import ForeignMapping, read_mapping
-from tubepose.foreign.reading import read_estimates, read_truth
 from tubepose.foreign.slot_matching import with_slots
 
 __all__ = [
