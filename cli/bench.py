@@ -13,6 +13,7 @@ from tubepose_cli.paths import named
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
+    from tubepose.benchmark import Bench
     from tubepose.evaluation import GateResult
 
 ALL_METHODS = "upright,profile,paper,slot-icp,global-icp"
@@ -80,7 +81,7 @@ def bench(
     from tubepose_cli.gating import GateOptions, finish_gates, gate_bench, read_asked
     from tubepose_cli.inputs import find_sessions, make_detector, read_methods, sample_session, used_model
     from tubepose_cli.results import run_estimates
-    from tubepose_cli.show import finish, progress, say, show_table
+    from tubepose_cli.show import finish, progress, say
 
     gate_options = GateOptions(baseline, fail_if, write_baseline_to, junit, summary_json, other_data)
     asked = read_asked(gate_options)
@@ -108,10 +109,7 @@ def bench(
     )  # fmt: skip
     if len(measured.truth):
         found = judge_run(plan, tables, options, settings)
-        found.write(out)
-        for table in found.tables.values():
-            show_table(table.cells, table.caption, table.notes)
-        say(f"all tables and rows: {out}")
+        _show(found, out)
         gates = gate_bench(out, found, asked, gate_options)
     elif asked.gates:
         problems.append("no trial could be judged, so no gate is passed")
@@ -119,3 +117,13 @@ def bench(
         say("no trial has a capture with printed caps that could be measured: no errors, no tables")
     finish([*problems, *tables.problems])
     finish_gates(gates)
+
+
+def _show(found: Bench, out: Path) -> None:
+    """Write what judges the run, and show its two tables."""
+    from tubepose_cli.show import say, show_table
+
+    found.write(out)
+    for table in found.tables.values():
+        show_table(table.cells, table.caption, table.notes)
+    say(f"all tables and rows: {out}")

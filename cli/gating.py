@@ -81,7 +81,7 @@ def write_reports(
     gates: Sequence[GateResult], summary: dict[str, Any], junit: Path | None, summary_json: Path | None
 ) -> None:
     """JUnit XML and the summary, where they are asked for."""
-    from tubepose.benchmark.verdict import junit_xml
+    from tubepose.benchmark.run_comparison import junit_xml
     from tubepose.report.writing import write_bytes, write_json
 
     if junit is not None:

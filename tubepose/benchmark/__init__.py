@@ -12,8 +12,8 @@ from tubepose.benchmark.plan import (
     judge_run,
     plan_bench,
 )
+from tubepose.benchmark.run_comparison import Comparison, compare, gate_alone, gate_table, junit_xml
 from tubepose.benchmark.runs import Run, fingerprint, read_run, tube_times_ms, write_baseline
-from tubepose.benchmark.verdict import Comparison, compare, gate_alone, gate_table, junit_xml
 
 __all__ = [
     "BENCH_METHODS",

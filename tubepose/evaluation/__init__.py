@@ -3,7 +3,7 @@
 from tubepose.evaluation.comparison import COMPARISON_COLUMNS, compare
 from tubepose.evaluation.gate import GATES, GateResult, gate_counts_alone, gate_pair, inside_95, read_gates
 from tubepose.evaluation.matching import AXES, ERROR_COLUMNS, ERROR_VALUES, OUTCOMES, evaluate
-from tubepose.evaluation.pairing import expected_tubes, pair_tubes, sign_flip_p, tube_changes
+from tubepose.evaluation.paired_tubes import expected_tubes, pair_tubes, sign_flip_p, tube_changes
 from tubepose.evaluation.summary import RECALL_LIMITS, seed_spread, slot_accuracy, summarise
 
 __all__ = [

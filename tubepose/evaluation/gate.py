@@ -11,7 +11,7 @@ from scipy.stats import chi2
 
 from tubepose.errors import ConfigError
 from tubepose.evaluation.matching import TRIAL
-from tubepose.evaluation.pairing import ABSENT, captures_of, expected_tubes, pair_tubes, sign_flip_p
+from tubepose.evaluation.paired_tubes import ABSENT, captures_of, expected_tubes, pair_tubes, sign_flip_p
 from tubepose.pose_errors import COVARIANCE_AXES
 from tubepose.statistics import BootstrapInterval, paired_bootstrap
 

@@ -14,7 +14,7 @@ from tubepose.benchmark.runs import Run, differences, read_run
 from tubepose.errors import ConfigError
 from tubepose.evaluation import inside_95
 from tubepose.evaluation.gate import GateResult, gate_counts_alone, gate_pair
-from tubepose.evaluation.pairing import PAIRED_ERRORS, captures_of, expected_tubes, pair_tubes, tube_changes
+from tubepose.evaluation.paired_tubes import PAIRED_ERRORS, captures_of, expected_tubes, pair_tubes, tube_changes
 from tubepose.report.tables import Table
 from tubepose.statistics import paired_bootstrap
 
