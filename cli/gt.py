@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from tubepose_cli.paths import named
+
+if TYPE_CHECKING:
+    from tubepose.labware import Labware
 
 
 def gt(
@@ -25,23 +28,25 @@ def gt(
     Writes ground_truth.csv and run.json into --out; on simulated sessions ground_truth_floor.csv too, its error against
     the exact truth.
     """
+    from tubepose.benchmark import measure_sessions
     from tubepose.capture.fusion import read_average
     from tubepose.config import Config
     from tubepose.provenance import inputs_sha256, run_record
     from tubepose.report.writing import write_json
     from tubepose_cli.inputs import find_sessions
-    from tubepose_cli.show import finish, say
-    from tubepose_cli.truth import measure_sessions
+    from tubepose_cli.show import finish, progress, say
 
     fused = read_average(average) if average is not None else 1
     folders, problems = find_sessions(sessions, fail_fast=fail_fast)
     used = inputs_sha256(folders, out)
-    measured = measure_sessions(folders, out, average=fused, fail_fast=fail_fast)
+    measured = measure_sessions(folders, out, average=fused, fail_fast=fail_fast, progress=progress)
     problems += measured.problems
     if not measured.sessions:
         finish(problems)
     caps = [session.printed_cap for session in measured.sessions if session.printed_cap is not None]
-    labware = [item for session in measured.sessions for item in (session.rack, *session.tubes.values())]
+    labware: list[Labware] = []
+    for session in measured.sessions:
+        labware += [session.rack, *session.tubes.values()]
     record = run_record(
         sys.argv, Config(), [*labware, *caps], used, problems=problems, ground_truth_config=measured.config
     )

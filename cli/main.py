@@ -11,11 +11,16 @@ from tubepose import __version__
 from tubepose.errors import StoppedError, TubePoseError, is_interrupt
 from tubepose_cli import data, detector, labware
 from tubepose_cli.bench import bench
+from tubepose_cli.compare import compare
 from tubepose_cli.estimate import estimate
+from tubepose_cli.evaluate import evaluate
+from tubepose_cli.export_bop import export_bop
 from tubepose_cli.gt import gt
 from tubepose_cli.measure import measure
+from tubepose_cli.repeat import repeat
 from tubepose_cli.sensor import sensor
 from tubepose_cli.simulate import simulate
+from tubepose_cli.slots import slots
 
 app = typer.Typer(
     name="tubepose",
@@ -24,7 +29,7 @@ app = typer.Typer(
     add_completion=False,
     pretty_exceptions_enable=False,
 )
-for _command in (estimate, gt, bench, simulate, sensor):
+for _command in (estimate, gt, bench, evaluate, compare, export_bop, repeat, slots, simulate, sensor):
     app.command()(_command)
 labware.app.command()(measure)
 app.add_typer(labware.app, name="labware")

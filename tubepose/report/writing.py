@@ -117,7 +117,16 @@ def write_json(path: Path, data: Mapping[str, Any]) -> None:
         ConfigError: The place cannot be written.
         TypeError: A value has no place in JSON.
     """
-    write_text(path, json.dumps(_plain(data), indent=2, ensure_ascii=False, allow_nan=False) + "\n")
+    write_text(path, json_text(data))
+
+
+def json_text(data: Mapping[str, Any]) -> str:
+    """The text that `write_json` writes.
+
+    Raises:
+        TypeError: A value has no place in JSON.
+    """
+    return json.dumps(_plain(data), indent=2, ensure_ascii=False, allow_nan=False) + "\n"
 
 
 def _plain(value: Any) -> Any:

@@ -1,21 +1,42 @@
-"""Ground truth for the commands `gt` and `bench`: measured, written, summed up in words."""
+"""Ground truth of whole sessions: measured from printed caps or exact, written, summed up in words."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import AbstractContextManager, contextmanager
+from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-if TYPE_CHECKING:
-    import pandas as pd
+import pandas as pd
 
-    from tubepose.capture.fusion import Average
-    from tubepose.capture.session import Session
-
+from tubepose.capture.fusion import Average
+from tubepose.capture.session import Session, load_session
+from tubepose.errors import CaptureError, kept
+from tubepose.ground_truth import GroundTruthConfig
+from tubepose.provenance import pinned_threads
+from tubepose.records import to_table
+from tubepose.report.writing import make_folder, remove_files, write_csv
+from tubepose.truth_tables import (
+    FLOOR_COLUMNS,
+    TRUTH_COLUMNS,
+    TruthTables,
+    exact_truth_rows,
+    floor_note,
+    measure_session,
+    refused_note,
+)
 
 FLOOR_FILE = "ground_truth_floor.csv"
 EXACT_NOTE = "Truth: the exact poses of the simulation, not those measured from printed caps."
+Progress = Callable[[str, int], AbstractContextManager[Callable[[], None]]]
+"""Shows progress: is given a title and a number of steps, and yields the function that a step calls when it is done."""
+
+
+@contextmanager
+def silent(title: str, total: int) -> Iterator[Callable[[], None]]:  # noqa: ARG001
+    """Progress that nobody watches."""
+    yield lambda: None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -40,31 +61,29 @@ class MeasuredTruth:
 
 
 def measure_sessions(
-    folders: Sequence[Path], out: Path, *, exact: bool = False, average: Average = 1, fail_fast: bool = False
+    folders: Sequence[Path],
+    out: Path | None,
+    *,
+    exact: bool = False,
+    average: Average = 1,
+    fail_fast: bool = False,
+    progress: Progress = silent,
 ) -> MeasuredTruth:
     """Measure all sessions, or take the exact poses of simulated ones, and write ground_truth.csv into `out`, if any.
 
     ground_truth_floor.csv is written too if one that was measured is simulated.
+
+    Args:
+        folders: Session folders.
+        out: Folder for the files; None to write none.
+        exact: Take the exact poses of simulated sessions.
+        average: How many frames of a static recording are fused into one.
+        fail_fast: Raise the first problem instead of keeping it.
+        progress: Shows how far it is.
+
+    Raises:
+        CaptureError: A session cannot be measured, and `fail_fast` is set.
     """
-    from dataclasses import asdict
-
-    from tubepose.capture.session import load_session
-    from tubepose.errors import CaptureError, kept
-    from tubepose.ground_truth import GroundTruthConfig
-    from tubepose.provenance import pinned_threads
-    from tubepose.records import to_table
-    from tubepose.report.writing import make_folder, remove_files, write_csv
-    from tubepose.truth_tables import (
-        FLOOR_COLUMNS,
-        TRUTH_COLUMNS,
-        TruthTables,
-        exact_truth_rows,
-        floor_note,
-        measure_session,
-        refused_note,
-    )
-    from tubepose_cli.show import progress
-
     sessions: list[Session] = []
     problems: list[str] = []
     for folder in folders:
@@ -81,7 +100,8 @@ def measure_sessions(
     if not sessions:
         nothing = to_table([], TRUTH_COLUMNS), to_table([], FLOOR_COLUMNS)
         return MeasuredTruth((), *nothing, (), tuple(problems), asdict(config))
-    make_folder(out)
+    if out is not None:
+        make_folder(out)
     with pinned_threads(1), progress("ground truth", sum(len(s.trials) for s in sessions)) as step:
         for session in sessions:
             if not exact:
@@ -91,14 +111,18 @@ def measure_sessions(
             with kept(keep):
                 tables.truth += exact_truth_rows(session, keep)
     truth, floor = to_table(tables.truth, TRUTH_COLUMNS), to_table(tables.floor, FLOOR_COLUMNS)
+    if out is not None:
+        _write(out, truth, floor)
+    notes = [EXACT_NOTE if exact else refused_note(truth), *tables.notes, *([floor_note(floor)] if len(floor) else [])]
+    return MeasuredTruth(tuple(sessions), truth, floor, tuple(notes), (*problems, *tables.problems), asdict(config))
+
+
+def _write(out: Path, truth: pd.DataFrame, floor: pd.DataFrame) -> None:
     write_csv(out / "ground_truth.csv", truth)
-    notes = [EXACT_NOTE if exact else refused_note(truth), *tables.notes]
     if len(floor):
         write_csv(out / FLOOR_FILE, floor)
-        notes.append(floor_note(floor))
     else:
         remove_files(out, [FLOOR_FILE])
-    return MeasuredTruth(tuple(sessions), truth, floor, tuple(notes), (*problems, *tables.problems), asdict(config))
 
 
 def _refuse_other_definitions(session: Session, others: Sequence[Session]) -> None:
@@ -107,8 +131,6 @@ def _refuse_other_definitions(session: Session, others: Sequence[Session]) -> No
     Raises:
         CaptureError: Another session has other labware of the same name.
     """
-    from tubepose.errors import CaptureError
-
     for other in others:
         known = {other.rack.name: other.rack, **other.types}
         for name, item in {session.rack.name: session.rack, **session.types}.items():
