@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -58,6 +57,8 @@ def bench(
         str | None,
         typer.Option(metavar="N|all", help="Fuse so many frames of a static recording, or all, into one."),
     ] = None,
+    resume: Annotated[bool, typer.Option("--resume", help="Go on after the last finished frame in --out.")] = False,
+    fresh: Annotated[bool, typer.Option("--fresh", help="Begin anew, whatever --out holds of a run.")] = False,
     fail_fast: Annotated[bool, typer.Option("--fail-fast", help="Stop at the first bad capture.")] = False,
 ) -> None:
     """Run every method on sessions, compare with the ground truth, and print the paper's two tables.
@@ -67,43 +68,44 @@ def bench(
     """
     from dataclasses import replace
 
-    from tubepose.batch import session_jobs
+    from tubepose.batch import Asked, session_jobs
     from tubepose.capture.fusion import read_average
     from tubepose.config import load_config
     from tubepose.errors import kept
+    from tubepose.result_folder import held_folder
     from tubepose.truth_tables import with_exact_rack
-    from tubepose_cli.inputs import find_sessions, make_detector, read_methods, sample_session, used_model
-    from tubepose_cli.results import run_estimates
+    from tubepose_cli.inputs import DetectorChoice, find_sessions, read_methods, sample_session
+    from tubepose_cli.results import RunOptions, run_estimates
     from tubepose_cli.show import finish, say
     from tubepose_cli.truth import measure_sessions
 
     settings = load_config(config)
     fused = read_average(average) if average is not None else 1
     names = read_methods(methods)
-    detector_for = make_detector(detector, model, boxes, classes, layout, settings)
+    source = DetectorChoice(detector, model, boxes, classes, layout, settings)
+    source.factory()  # what is wrong with its files is told before any work
     jobs: list[Job] = []
     folders, problems = find_sessions(sessions or [sample_session()], fail_fast=fail_fast)
-    measured = measure_sessions(folders, out, exact=exact_truth, average=fused, fail_fast=fail_fast)
-    if not measured.sessions:
-        finish([*problems, *measured.problems])  # before anything of an earlier run is written over
-    for session in measured.sessions:
-        keep = None if fail_fast else problems
-        with kept(keep):
-            found, unread = session_jobs(session, fail_fast=fail_fast)
-            problems += unread
-            if all_tubes:
-                found = [replace(job, tubes=tuple(session.types.values())) for job in found]
-            jobs += with_exact_rack(found, session, keep) if known_rack else found
-    problems = list(dict.fromkeys([*problems, *measured.problems]))  # both can miss the same file of a trial
-    tables = run_estimates(
-        jobs, names, detector_for, settings, out, sys.argv, seeds=seeds, overlays=overlays, fail_fast=fail_fast,
-        warm_up=True, inputs=[
-            *(path for path in (used_model(detector, model), boxes, classes, config) if path is not None),
-            *(session.folder for session in measured.sessions),
-        ],
-        labware=[] if exact_truth else [s.printed_cap for s in measured.sessions if s.printed_cap is not None],
-        problems=problems, detector=detector, averaged=average is not None, ground_truth_config=measured.config,
-    )  # fmt: skip
+    with held_folder(out):
+        measured = measure_sessions(folders, out, exact=exact_truth, average=fused, fail_fast=fail_fast)
+        if not measured.sessions:
+            finish([*problems, *measured.problems])  # before anything of an earlier run is written over
+        for session in measured.sessions:
+            keep = None if fail_fast else problems
+            with kept(keep):
+                found, unread = session_jobs(session, fail_fast=fail_fast)
+                problems += unread
+                if all_tubes:
+                    found = [replace(job, tubes=tuple(session.types.values())) for job in found]
+                jobs += with_exact_rack(found, session, keep) if known_rack else found
+        problems = list(dict.fromkeys([*problems, *measured.problems]))  # both can miss the same file of a trial
+        tables = run_estimates(
+            jobs, Asked(names, settings, seeds, warm_up=True), source, out,
+            RunOptions(resume=resume, fresh=fresh, fail_fast=fail_fast, overlays=overlays),
+            inputs=[*([config] if config is not None else []), *(session.folder for session in measured.sessions)],
+            labware=[] if exact_truth else [s.printed_cap for s in measured.sessions if s.printed_cap is not None],
+            problems=problems, averaged=average is not None, ground_truth_config=measured.config,
+        )  # fmt: skip
     if len(measured.truth):
         _report(tables, measured, jobs, names, settings, out, seeds, published)
     elif not exact_truth:
