@@ -12,7 +12,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +21,7 @@ import pytest
 from commands import tubepose
 from test_batch import CONFIG, GOOD, RACK, TUBE, Recorded
 
-from tubepose.batch import Asked, Job, Limits, Schedule, Setup, fill_tables, run_schedule, session_jobs
+from tubepose.batch import Asked, Job, Limits, Schedule, Setup, fill_tables, run_jobs, run_schedule, session_jobs
 from tubepose.batch.record_store import FolderStore, MemoryStore, RecordFolder
 from tubepose.batch.run_index import JobIndex, Shard, open_records, read_shard, run_index
 from tubepose.batch.tasks import Ended, FrameRecord, Outcome, Task
@@ -52,17 +52,17 @@ class Scan:
         for index in range(self.count):
             if index == self.bad and self.how == "load":
                 os.kill(os.getpid(), signal.SIGKILL)
-            stamp = -1 if index == self.bad and self.how != "load" else 1000 + index
+            stamp = 7 if index == self.bad and self.how != "load" else 1000 + index
             yield RgbdFrame(GOOD.cloud_m, GOOD.image, None, stamp, self.name, index, False, self.how)
 
 
 class Unsafe(Detector):
-    """Sees nothing; a frame with a stamp of -1 kills its process, keeps it, or breaks."""
+    """Sees nothing; a frame with a stamp of 7 kills its process, keeps it, or breaks."""
 
     name = "unsafe"
 
     def detect(self, frame: RgbdFrame) -> Any:
-        if frame.timestamp_ns == -1:
+        if frame.timestamp_ns == 7:
             if frame.sensor == "kill":
                 os.kill(os.getpid(), signal.SIGKILL)
             if frame.sensor == "hang":
@@ -388,3 +388,13 @@ def test_a_trial_names_a_capture_in_its_session(original: str, words: str, tmp_p
     jobs, (problem,) = session_jobs(load_session(tmp_path))
     assert jobs == []
     assert words in problem
+
+
+@pytest.mark.parametrize("stamp", [2**63, 2**64 - 1, -1])
+def test_a_stamp_that_is_no_time_costs_its_capture_alone(stamp: int) -> None:
+    jobs = [
+        Job(Recorded(name, (replace(GOOD, timestamp_ns=at),)), RACK, (TUBE,)) for name, at in (("a", stamp), ("b", 1))
+    ]
+    tables = run_jobs(jobs, ("upright",), make_unsafe, CONFIG)
+    assert len(tables.racks) == 1
+    assert [line.startswith(f"a: its stamp {stamp} ns is no time") for line in tables.problems] == [True]

@@ -99,6 +99,8 @@ class Performer:
         if frame is None:
             return Outcome(Ended.NO_FRAME)
         self._loaded = True
+        if frame.timestamp_ns is not None and not 0 <= frame.timestamp_ns < 2**63:
+            raise CaptureError(f"its stamp {frame.timestamp_ns} ns is no time; expected 0 to 2^63 - 1 nanoseconds")
         job, named = self.setup.jobs[task.number], task.named
         if isinstance(job, UnnamedJob):
             if named is None:
