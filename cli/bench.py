@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -68,6 +67,8 @@ def bench(
     other_data: Annotated[
         bool, typer.Option("--other-data", help="Gate though data, labware or versions differ from the baseline's.")
     ] = False,
+    resume: Annotated[bool, typer.Option("--resume", help="Go on after the last finished frame in --out.")] = False,
+    fresh: Annotated[bool, typer.Option("--fresh", help="Begin anew, whatever --out holds of a run.")] = False,
     fail_fast: Annotated[bool, typer.Option("--fail-fast", help="Stop at the first bad capture.")] = False,
 ) -> None:
     """Run every method on sessions, compare with the ground truth, and print the paper's two tables.
@@ -75,12 +76,14 @@ def bench(
     Writes what estimate and gt write, and errors, summary, comparison, uncertainty, coverage, confusion, seeds and
     slot_accuracy.csv, table_accuracy.{csv,md,tex} and table_timing.{csv,md,tex} into --out.
     """
+    from tubepose.batch import Asked
     from tubepose.benchmark import BenchOptions, judge_run, plan_bench
     from tubepose.capture.fusion import read_average
     from tubepose.config import load_config
+    from tubepose.result_folder import held_folder
     from tubepose_cli.gating import GateOptions, finish_gates, gate_bench, read_asked
-    from tubepose_cli.inputs import find_sessions, make_detector, read_methods, sample_session, used_model
-    from tubepose_cli.results import run_estimates
+    from tubepose_cli.inputs import DetectorChoice, find_sessions, read_methods, sample_session
+    from tubepose_cli.results import RunOptions, run_estimates
     from tubepose_cli.show import finish, progress, say
 
     gate_options = GateOptions(baseline, fail_if, write_baseline_to, junit, summary_json, other_data)
@@ -90,23 +93,23 @@ def bench(
         read_methods(methods), seeds, exact_truth, known_rack, all_tubes, published, fail_fast,
         read_average(average) if average is not None else 1,
     )  # fmt: skip
-    detector_for = make_detector(detector, model, boxes, classes, layout, settings)
+    source = DetectorChoice(detector, model, boxes, classes, layout, settings)
+    source.factory()  # what is wrong with its files is told before any work
     folders, problems = find_sessions(sessions or [sample_session()], fail_fast=fail_fast)
-    plan = plan_bench(folders, out, options, progress)
-    measured = plan.measured
-    problems = list(dict.fromkeys([*problems, *plan.problems]))
-    if not measured.sessions:
-        finish(problems)  # before anything of an earlier run is written over
     gates: Sequence[GateResult] = ()
-    tables = run_estimates(
-        plan.jobs, options.methods, detector_for, settings, out, sys.argv, seeds=seeds, overlays=overlays,
-        fail_fast=fail_fast, warm_up=True, inputs=[
-            *(path for path in (used_model(detector, model), boxes, classes, config) if path is not None),
-            *(session.folder for session in measured.sessions),
-        ],
-        labware=[] if exact_truth else [s.printed_cap for s in measured.sessions if s.printed_cap is not None],
-        problems=problems, detector=detector, averaged=average is not None, ground_truth_config=measured.config,
-    )  # fmt: skip
+    with held_folder(out):
+        plan = plan_bench(folders, out, options, progress)
+        measured = plan.measured
+        problems = list(dict.fromkeys([*problems, *plan.problems]))
+        if not measured.sessions:
+            finish(problems)  # before anything of an earlier run is written over
+        tables = run_estimates(
+            plan.jobs, Asked(options.methods, settings, seeds, warm_up=True), source, out,
+            RunOptions(resume=resume, fresh=fresh, fail_fast=fail_fast, overlays=overlays),
+            inputs=[*([config] if config is not None else []), *(session.folder for session in measured.sessions)],
+            labware=[] if exact_truth else [s.printed_cap for s in measured.sessions if s.printed_cap is not None],
+            problems=problems, averaged=average is not None, ground_truth_config=measured.config,
+        )  # fmt: skip
     if len(measured.truth):
         found = judge_run(plan, tables, options, settings)
         _show(found, out)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -102,20 +101,38 @@ def estimate(
     seeds: Annotated[int, typer.Option(min=1, help="Seeds of a stochastic method: 0 to N-1.")] = 1,
     config: Annotated[Path | None, typer.Option(help="YAML file that changes defaults (docs/method.md).")] = None,
     overlays: Annotated[bool, typer.Option(help="Write one overlay picture per frame.")] = True,
+    jobs: Annotated[
+        int | None,
+        typer.Option(min=1, envvar="TUBEPOSE_JOBS", help="Local processes; default: one per core."),
+    ] = None,
+    timeout: Annotated[
+        float | None, typer.Option(min=0.001, help="Seconds that a frame may take in a process of --jobs (600).")
+    ] = None,
+    shard: Annotated[
+        str | None, typer.Option(metavar="I/N", help="Only this part of the captures; 'tubepose merge' joins them.")
+    ] = None,
+    allow_outside: Annotated[
+        bool, typer.Option("--allow-outside", help="Sessions and captures may name files out of their folders.")
+    ] = False,
+    resume: Annotated[bool, typer.Option("--resume", help="Go on after the last finished frame in --out.")] = False,
+    fresh: Annotated[bool, typer.Option("--fresh", help="Begin anew, whatever --out holds of a run.")] = False,
     fail_fast: Annotated[bool, typer.Option("--fail-fast", help="Stop at the first bad capture.")] = False,
 ) -> None:
     """Estimate the pose of the rack and of every tube in recorded captures.
 
     Writes racks, sensor, slots, estimates, checks, labware_check and timings.csv, run.json and overlays/ into --out.
     """
+    from tubepose.batch import Asked
+    from tubepose.batch.run_index import read_shard
     from tubepose.capture.fusion import read_average
     from tubepose.capture.session import SESSION_FILE, is_session
     from tubepose.config import load_config
     from tubepose.errors import CaptureError, kept
+    from tubepose.result_folder import held_folder
     from tubepose_cli.hints import read_hints, refuse_unknown_captures
     from tubepose_cli.inputs import (
+        DetectorChoice,
         capture_jobs,
-        make_detector,
         no_such_file,
         read_methods,
         read_tubes,
@@ -123,10 +140,9 @@ def estimate(
         refuse_idle_topics,
         refuse_twins,
         sessions_below,
-        used_model,
     )
     from tubepose_cli.racks import read_rack
-    from tubepose_cli.results import run_estimates
+    from tubepose_cli.results import RunOptions, run_estimates
     from tubepose_cli.show import finish, say
 
     settings = load_config(config)
@@ -137,9 +153,11 @@ def estimate(
         finish([no_such_file(path) for path in captures])
     told = read_hints(hint or (), hints, choice.rack)
     methods = read_methods(method)
-    detector_for = make_detector(detector, model, boxes, classes, layout, settings)
+    source = DetectorChoice(detector, model, boxes, classes, layout, settings)
+    source.factory()  # what is wrong with its files is told before any work
+    part = read_shard(shard) if shard is not None else None
     topics = {"cloud": cloud_topic, "depth": depth_topic, "image": image_topic, "info": info_topic}
-    jobs: list[Job | UnnamedJob] = []
+    all_jobs: list[Job | UnnamedJob] = []
     problems: list[str] = []
     captures = [found for path in captures for found in (sessions_below(path) or [path])]
     for path in captures:
@@ -155,30 +173,33 @@ def estimate(
                 hints=told,
                 topics=topics,
                 average=fused,
+                allow_outside=allow_outside,
                 fail_fast=fail_fast,
             )
-            distinct, twins = refuse_twins(found, jobs)
+            distinct, twins = refuse_twins(found, all_jobs)
             if twins and fail_fast:
                 raise CaptureError(twins[0])
-            jobs += distinct
+            all_jobs += distinct
             problems += [*unread, *twins]
-    if not jobs:
+    if not all_jobs:
         finish(problems)  # before anything of an earlier run is written over
-    refuse_idle_topics(jobs, {**topics, "max-stamp-difference": max_stamp_difference})
-    refuse_idle_scale(jobs, depth_scale)
+    refuse_idle_topics(all_jobs, {**topics, "max-stamp-difference": max_stamp_difference})
+    refuse_idle_scale(all_jobs, depth_scale)
     with kept(problems if problems and not fail_fast else None):
-        refuse_unknown_captures(jobs, told)
-    tables = run_estimates(
-        jobs, methods, detector_for, settings, out, sys.argv, seeds=seeds, overlays=overlays, fail_fast=fail_fast,
-        inputs=[
-            *(path for path in (used_model(detector, model), boxes, classes, hints, config) if path is not None),
-            *(path for path in captures if path.exists() and (path.name == SESSION_FILE or is_session(path))),
-        ],
-        problems=problems, detector=detector, averaged=average is not None,
-    )  # fmt: skip
+        refuse_unknown_captures(all_jobs, told)
+    how = RunOptions(jobs, timeout, resume, fresh, part, fail_fast, overlays)
+    with held_folder(out):
+        tables = run_estimates(
+            all_jobs, Asked(methods, settings, seeds), source, out, how,
+            inputs=[
+                *(path for path in (hints, config) if path is not None),
+                *(path for path in captures if path.exists() and (path.name == SESSION_FILE or is_session(path))),
+            ],
+            problems=problems, averaged=average is not None,
+        )  # fmt: skip
     _tell(tables, several=len(methods) > 1)
     _tell_notes(tables)
-    if tubes is None and any(not job.tubes for job in jobs):
+    if tubes is None and any(not job.tubes for job in all_jobs):
         say("no --tubes given: only the rack and its slots are estimated")
     finish([*problems, *tables.problems, *(_ambiguous(tables) if require_unambiguous else [])])
 

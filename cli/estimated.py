@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -27,19 +26,20 @@ def run_folder(paths: Sequence[Path], asked: Asked, out: Path) -> tuple[Path, li
 
     One path that is the folder of a run is taken as it is; captures are estimated into `out`.
     """
+    from tubepose.batch import Asked as Question
     from tubepose.config import load_config
     from tubepose.errors import kept
+    from tubepose.result_folder import held_folder
     from tubepose_cli.inputs import (
+        DetectorChoice,
         capture_jobs,
-        make_detector,
         read_methods,
         read_tubes,
         refuse_twins,
         sessions_below,
-        used_model,
     )
     from tubepose_cli.racks import read_rack
-    from tubepose_cli.results import run_estimates
+    from tubepose_cli.results import RunOptions, run_estimates
     from tubepose_cli.show import finish
 
     if len(paths) == 1 and (paths[0] / "estimates.csv").is_file() and (paths[0] / "racks.csv").is_file():
@@ -56,12 +56,12 @@ def run_folder(paths: Sequence[Path], asked: Asked, out: Path) -> tuple[Path, li
             problems += [*unread, *twins]
     if not jobs:
         finish(problems)
-    model = used_model(asked.detector, None)
-    tables = run_estimates(
-        jobs, read_methods(asked.method), make_detector(asked.detector, None, None, None, None, settings), settings,
-        out, sys.argv, overlays=False, inputs=[model] if model is not None else [], problems=problems,
-        detector=asked.detector,
-    )  # fmt: skip
+    source = DetectorChoice(asked.detector, None, None, None, None, settings)
+    with held_folder(out):
+        tables = run_estimates(
+            jobs, Question(tuple(read_methods(asked.method)), settings, 1), source, out,
+            RunOptions(fresh=True, overlays=False), problems=problems,
+        )  # fmt: skip
     return out, [*problems, *tables.problems]
 
 

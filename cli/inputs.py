@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import difflib
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -111,6 +111,7 @@ def capture_jobs(
     hints: HintChoice | None = None,
     topics: Mapping[str, str | None] | None = None,
     average: Average = 1,
+    allow_outside: bool = False,
     fail_fast: bool = False,
 ) -> tuple[list[Job | UnnamedJob], list[str]]:
     """Jobs of one typed path (a session's trials, or the captures found there), and what could not be opened.
@@ -133,7 +134,9 @@ def capture_jobs(
                 f"{path}: {', '.join(idle)} given, but a session says that itself: unit, depth_scale_m, "
                 "max_stamp_difference_ms, topics, and a trial's hint; leave it out, or give the captures one by one"
             )
-        known, problems = session_jobs(load_session(path, average), fail_fast=fail_fast)
+        known, problems = session_jobs(
+            load_session(path, average).model_copy(update={"allow_outside": allow_outside}), fail_fast=fail_fast
+        )
         if choice.open:
             find = rack_finder(choice, config)
             return [
@@ -152,6 +155,7 @@ def capture_jobs(
         depth_scale_m=depth_scale_m,
         max_stamp_difference_ms=max_stamp_difference_ms,
         average=average,
+        allow_outside=allow_outside,
         **topic,
     )
     told = [(capture, *(hints.of(capture.name) if hints else (None, False))) for capture in opened]
@@ -219,6 +223,36 @@ def refuse_idle_scale(jobs: Sequence[Job | UnnamedJob], depth_scale_m: float | N
 
     if depth_scale_m is not None and all(job.capture.path.suffix.lower() in CLOUD_READERS for job in jobs):
         raise ConfigError("--depth-scale given, but no depth image is there; a cloud's unit is --unit; leave it out")
+
+
+@dataclass(frozen=True, slots=True)
+class DetectorChoice:
+    """The source of boxes as it was typed; another process can have it, and make the detector from it.
+
+    Attributes:
+        name: In `DETECTORS`.
+        model: ONNX file of ``yolo``; None is the bundled one.
+        boxes: Of ``recorded``.
+        classes: Names of the classes.
+        layout: Of the model's output.
+        config: All sections.
+    """
+
+    name: str
+    model: Path | None
+    boxes: Path | None
+    classes: Path | None
+    layout: str | None
+    config: Config
+
+    def factory(self) -> DetectorFactory:
+        """Read its files and make it."""
+        return make_detector(self.name, self.model, self.boxes, self.classes, self.layout, self.config)
+
+    @property
+    def files(self) -> tuple[Path, ...]:
+        """What it depends on."""
+        return tuple(p for p in (used_model(self.name, self.model), self.boxes, self.classes) if p is not None)
 
 
 def used_model(detector: str, model: Path | None) -> Path | None:

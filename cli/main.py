@@ -17,6 +17,7 @@ from tubepose_cli.evaluate import evaluate
 from tubepose_cli.export_bop import export_bop
 from tubepose_cli.gt import gt
 from tubepose_cli.measure import measure
+from tubepose_cli.merge import merge
 from tubepose_cli.repeat import repeat
 from tubepose_cli.sensor import sensor
 from tubepose_cli.simulate import simulate
@@ -29,7 +30,7 @@ app = typer.Typer(
     add_completion=False,
     pretty_exceptions_enable=False,
 )
-for _command in (estimate, gt, bench, evaluate, compare, export_bop, repeat, slots, simulate, sensor):
+for _command in (estimate, gt, bench, evaluate, compare, export_bop, repeat, slots, simulate, sensor, merge):
     app.command()(_command)
 labware.app.command()(measure)
 app.add_typer(labware.app, name="labware")
@@ -55,13 +56,13 @@ def main(
 def run() -> None:
     """Entry point: an error that the user can correct is one line on stderr and exit 1; a wrong usage is exit 2.
 
-    Ctrl-C is exit 130.
+    A signal that stopped it is exit 128 and its number, as of a command that has not caught it: 130 of Ctrl-C.
     """
     try:
         app()
     except TubePoseError as problem:
         print(f"error: {problem}", file=sys.stderr)
-        sys.exit(130 if isinstance(problem, StoppedError) else 1)
+        sys.exit(128 + problem.number if isinstance(problem, StoppedError) else 1)
     except OSError as problem:
         if problem.filename is None:
             raise

@@ -87,16 +87,24 @@ def _sides(option: str, text: str) -> tuple[float, float]:
     return sides[0], sides[-1]
 
 
-def rack_finder(choice: RackChoice, config: Config) -> RackFinder:
-    """What finds the rack of a frame where ``--rack`` is ``auto`` or ``grid``."""
-    from tubepose.rack.grid import register_grid
-    from tubepose.rack.naming import name_rack
+@dataclass(frozen=True)
+class FindRack:
+    """What finds the rack of a frame where ``--rack`` is ``auto`` or ``grid``; other processes can have it."""
 
-    def find(frame: RgbdFrame) -> RackPose:
+    lattice: SlotLattice | None
+    config: Config
+
+    def __call__(self, frame: RgbdFrame) -> RackPose:
+        from tubepose.rack.grid import register_grid
+        from tubepose.rack.naming import name_rack
+
         points_m = frame.measured_m
-        if choice.lattice is not None:
-            return register_grid(points_m, choice.lattice, config, frame.intrinsics)
-        pose, _ = name_rack(points_m, config, intrinsics=frame.intrinsics)
+        if self.lattice is not None:
+            return register_grid(points_m, self.lattice, self.config, frame.intrinsics)
+        pose, _ = name_rack(points_m, self.config, intrinsics=frame.intrinsics)
         return pose
 
-    return find
+
+def rack_finder(choice: RackChoice, config: Config) -> RackFinder:
+    """What finds the rack of a frame where ``--rack`` is ``auto`` or ``grid``."""
+    return FindRack(choice.lattice, config)

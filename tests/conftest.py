@@ -6,6 +6,7 @@ timed, as machines differ. `pytest --hypothesis-profile search` tries new ones.
 
 from __future__ import annotations
 
+import os
 from collections import Counter
 from pathlib import Path
 from typing import Any
@@ -17,6 +18,8 @@ from hypothesis import settings
 settings.register_profile("same", deadline=None, derandomize=True)
 settings.register_profile("search", deadline=None)
 settings.load_profile("same")
+
+os.environ["TUBEPOSE_JOBS"] = "1"  # unless a test asks for processes
 
 LIGHT = ("test_structured_light.py", "test_simulation_sessions.py", "test_benchmark_surfaces.py")
 """Files that follow light through plastic, whose loops take a minute to compile; the first begins with those."""

@@ -10,7 +10,7 @@ import pandas as pd
 import pytest
 import scenes
 
-from tubepose.batch import MOST_ASKED, Job, UnnamedJob, run_jobs, running, session_jobs, trial_capture
+from tubepose.batch import MOST_ASKED, Job, UnnamedJob, framing, run_jobs, session_jobs, trial_capture
 from tubepose.capture.frame import RgbdFrame
 from tubepose.capture.hints import SlotHint
 from tubepose.capture.session import Session, load_session
@@ -70,13 +70,14 @@ GOOD = make_frame("good")
 
 
 def test_a_bad_capture_stops_neither_the_ones_before_nor_the_ones_after() -> None:
-    done: list[int] = []
+    done: list[tuple[int, int]] = []
     broken = job("broken", replace(GOOD, capture="broken"), problem=CaptureError("cut after 1 frame"))
     nothing = job("nothing", problem=CaptureError("captures/scan: no such file"))
-    tables = run(job("good", GOOD), broken, nothing, job("good", GOOD), on_done=lambda: done.append(1))
+    tables = run(job("good", GOOD), broken, nothing, job("good", GOOD), on_done=lambda *counts: done.append(counts))
     assert [row["capture"] for row in tables.racks] == ["good", "broken", "good"]
     assert tables.problems == ["broken: cut after 1 frame", "captures/scan: no such file"]
-    assert len(done) == 4
+    assert [count for count, _ in done] == [1, 2, 3, 4, 5]  # three frames and two problems
+    assert done[-1] == (5, 5)
 
 
 def test_a_detector_that_cannot_work_is_a_problem_of_its_capture() -> None:
@@ -101,14 +102,14 @@ def in_compiled_code(problem: BaseException) -> SystemError:
 @pytest.mark.parametrize(
     "stop", [KeyboardInterrupt(), in_compiled_code(KeyboardInterrupt())], ids=["python", "compiled"]
 )
-def test_ctrl_c_keeps_the_rows_of_what_was_done(stop: BaseException) -> None:
+def test_ctrl_c_keeps_the_rows_of_frames_that_were_done(stop: BaseException) -> None:
     cut = job("cut", replace(GOOD, capture="cut"), problem=stop)
     tables = Tables()
     with pytest.raises(KeyboardInterrupt):
         run(job("good", GOOD), cut, job("later", replace(GOOD, capture="later")), tables=tables)
-    assert (tables.done, tables.problems) == (1, [])
+    assert (tables.done, tables.problems) == (2, [])
     for rows in (tables.racks, tables.slots, tables.estimates, tables.timings, tables.checks, tables.labware_check):
-        assert {row["capture"] for row in rows} == {"good"}
+        assert {row["capture"] for row in rows} == {"good", "cut"}
 
 
 def test_why_and_which_marks_stand_in_every_table(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -117,7 +118,7 @@ def test_why_and_which_marks_stand_in_every_table(monkeypatch: pytest.MonkeyPatc
         checks = (*scene.rack_pose.checks, Check("scale", 1.0, 0.5, False, decides=False))
         return replace(scene, rack_pose=replace(scene.rack_pose, checks=checks))
 
-    monkeypatch.setattr("tubepose.batch.running.prepare_scene", marked)
+    monkeypatch.setattr("tubepose.batch.framing.prepare_scene", marked)
     tables = run(job("good", GOOD), job("bad", make_frame("bad", scale=0.5)), methods=("profile", "paper"))
     good, bad = ([row for row in tables.racks if row["capture"] == name] for name in ("good", "bad"))
     assert {(row["reason_code"], "scale" in row["marks"].split(";")) for row in good} == {("", True)}
@@ -174,7 +175,7 @@ def test_every_set_of_types_is_warmed_up() -> None:
 
 def test_times_of_a_frame_in_which_code_is_compiled_are_marked(monkeypatch: pytest.MonkeyPatch) -> None:
     counts = iter([0, 0, 0, 3])  # before and after each of two frames
-    monkeypatch.setattr(running, "compilations", lambda: next(counts))
+    monkeypatch.setattr(framing, "compilations", lambda: next(counts))
     tables = run(job("good", GOOD), job("late", GOOD), warm_up=True)
     tubes = [row["warmup"] for row in tables.timings if row["stage"] == "tube"]
     assert tubes == [True, False, True]

@@ -90,6 +90,10 @@ class _Compilations(events.Listener):
 
     def on_start(self, event: Any) -> None:  # noqa: ARG002
         self.count += 1
+        self.say()
+
+    def say(self) -> None:
+        """Call what is to be told, once."""
         if self.tell is not None:
             tell, self.tell = self.tell, None
             tell()
@@ -110,6 +114,11 @@ def compilations() -> int:
 def before_compiling(tell: Callable[[], object]) -> None:
     """Call a function before this process next compiles a loop, once; machine code that was kept needs no compiling."""
     _COMPILATIONS.tell = tell
+
+
+def tell_compiling() -> None:
+    """Call what `before_compiling` was given: another process of the batch compiles."""
+    _COMPILATIONS.say()
 
 
 @compiled

@@ -5,6 +5,7 @@ The command line prints it and exits with 1; a batch records it and goes on with
 Bad data inside one frame is not an error but a status in the tables; a broken invariant is an ordinary exception.
 """
 
+import signal
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
@@ -42,15 +43,51 @@ class ConfigError(TubePoseError):
     """A configuration file or an option is wrong."""
 
 
+class OutputError(ConfigError):
+    """The folder of results cannot be written: no other capture would do better, so a batch ends with it."""
+
+
 class StoppedError(TubePoseError):
-    """The user stopped a batch (Ctrl-C); what was done by then is kept."""
+    """A signal stopped a batch (Ctrl-C, SIGTERM, SIGHUP); what was done by then is kept.
+
+    Attributes:
+        number: Of the signal.
+    """
+
+    def __init__(self, text: str, number: int = signal.SIGINT) -> None:
+        super().__init__(text)
+        self.number = number
+
+
+class Interrupt(KeyboardInterrupt):
+    """A signal that asks the process to end.
+
+    Attributes:
+        number: Of the signal.
+    """
+
+    def __init__(self, number: int) -> None:
+        super().__init__(number)
+        self.number = number
 
 
 def is_interrupt(problem: BaseException | None) -> bool:
     """Whether an exception is Ctrl-C, or what compiled code makes of one."""
+    return interrupt_number(problem) != 0
+
+
+def interrupt_number(problem: BaseException | None) -> int:
+    """The signal behind an exception, also where compiled code made another one of it; 0 where there is none."""
     if isinstance(problem, SystemError):
-        return is_interrupt(problem.__cause__ or problem.__context__)
-    return isinstance(problem, KeyboardInterrupt)
+        return interrupt_number(problem.__cause__ or problem.__context__)
+    if isinstance(problem, Interrupt):
+        return problem.number
+    return int(signal.SIGINT) if isinstance(problem, KeyboardInterrupt) else 0
+
+
+def readable(name: str) -> str:
+    """A file's name as tables and pictures have it: bytes that are no UTF-8 are written as escapes, as in Python."""
+    return name.encode("utf-8", "surrogateescape").decode("utf-8", "backslashreplace")
 
 
 @contextmanager

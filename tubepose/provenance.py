@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import hashlib
 import os
 import platform
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from functools import cache
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
@@ -59,6 +61,21 @@ def _sha256(path: Path, out: Path) -> str:
         return file_sha256(path) if path.is_file() else tree_sha256(path, out)
     except OSError as problem:
         return f"cannot be read: {problem.strerror}"
+
+
+def content_sha256(path: Path, out: Path) -> str:
+    """Digest of a file or folder, as `inputs_sha256` takes it."""
+    return _sha256(path, out)
+
+
+@cache
+def code_sha256() -> str:
+    """Digest of the package's own sources, which a version number between two releases does not tell apart."""
+    root = Path(__file__).parent
+    digest = hashlib.sha256()
+    for path in sorted(root.rglob("*.py")):
+        digest.update(path.relative_to(root).as_posix().encode() + b"\0" + path.read_bytes())
+    return digest.hexdigest()
 
 
 def run_record(

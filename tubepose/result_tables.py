@@ -7,6 +7,9 @@ from dataclasses import dataclass, field
 from tubepose.labware import Labware
 from tubepose.records import Row
 
+TABLES = ("racks", "sensor", "slots", "estimates", "timings", "checks", "labware_check")
+"""Names of those that have rows."""
+
 
 @dataclass(slots=True)
 class Tables:
@@ -21,8 +24,8 @@ class Tables:
         checks: One per check of a rack or of a tube, frame and method.
         labware_check: One per frame and size that it shows of a rack or of a type of tube.
         labware: Every rack and tube that was looked for, by name.
-        problems: One line per capture that could not be finished.
-        done: How many captures were finished or failed: all of them, but where the user stops the batch.
+        problems: One line per frame or capture that could not be done.
+        done: How many frames there are rows of.
     """
 
     racks: list[Row] = field(default_factory=list)
@@ -36,14 +39,8 @@ class Tables:
     problems: list[str] = field(default_factory=list)
     done: int = 0
 
-    def lengths(self) -> tuple[int, ...]:
-        """How many rows there are, table by table."""
-        return tuple(len(rows) for rows in self._rows())
-
-    def cut(self, lengths: tuple[int, ...]) -> None:
-        """Leave out the rows that came after there were so many."""
-        for rows, length in zip(self._rows(), lengths, strict=True):
-            del rows[length:]
-
-    def _rows(self) -> tuple[list[Row], ...]:
-        return self.racks, self.sensor, self.slots, self.estimates, self.timings, self.checks, self.labware_check
+    def add(self, other: Tables) -> None:
+        """Add the rows and the labware of others."""
+        for name in TABLES:
+            getattr(self, name).extend(getattr(other, name))
+        self.labware |= other.labware

@@ -9,15 +9,24 @@ from tubepose.batch.jobs import (
     session_jobs,
     trial_capture,
 )
-from tubepose.batch.running import run_jobs
+from tubepose.batch.running import fill_tables, run_jobs, run_schedule
+from tubepose.batch.schedule import Schedule
+from tubepose.batch.tasks import Asked, Setup
+from tubepose.batch.workers import Limits
 
 __all__ = [
     "MOST_ASKED",
+    "Asked",
     "DetectorFactory",
     "Job",
+    "Limits",
     "RackFinder",
+    "Schedule",
+    "Setup",
     "UnnamedJob",
+    "fill_tables",
     "run_jobs",
+    "run_schedule",
     "session_jobs",
     "trial_capture",
 ]

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
 from tubepose.capture.frame import RgbdFrame
 from tubepose.capture.hints import SlotHint
+from tubepose.capture.regular import require_inside
 from tubepose.capture.session import Session, Trial
 from tubepose.capture.source import Capture, open_captures
 from tubepose.detection import Detector
@@ -97,6 +99,12 @@ def trial_capture(session: Session, trial: Trial, relative: str) -> Capture:
     Raises:
         CaptureError: It is not there, or it is a folder of several.
     """
+    if not session.allow_outside:
+        require_inside(session.folder, relative, f"trial {trial.name} names a capture that")
+    if os.path.normpath(relative) in (os.curdir, ""):
+        raise CaptureError(
+            f"{session.folder}: trial {trial.name} names the session's own folder '{relative}'; name its capture in it"
+        )
     place = session.folder / relative
     paths = {path for one in session.trials for path in (one.original, one.printed) if path is not None}
     whole = Path(relative).with_suffix("" if place.is_file() else Path(relative).suffix).as_posix()
@@ -104,7 +112,8 @@ def trial_capture(session: Session, trial: Trial, relative: str) -> Capture:
     topics = {f"{kind}_topic": topic for kind, topic in session.topics.model_dump().items()}
     found = open_captures(
         place, name=name, unit=session.unit, depth_scale_m=session.depth_scale_m,
-        max_stamp_difference_ms=session.max_stamp_difference_ms, average=session.average, **topics,
+        max_stamp_difference_ms=session.max_stamp_difference_ms, average=session.average,
+        allow_outside=session.allow_outside, **topics,
     )  # fmt: skip
     if len(found) != 1:
         raise CaptureError(f"{place}: trial {trial.name} needs one capture, found {len(found)}")

@@ -26,6 +26,7 @@ from tubepose.capture.formats.depth_images import read_depth
 from tubepose.capture.frame import RgbdFrame
 from tubepose.capture.images import read_picture
 from tubepose.capture.registration import METRES_PER_UNIT, clean_cloud, depth_to_metres, project_cloud
+from tubepose.capture.regular import leaves, require_inside, require_regular
 from tubepose.errors import CaptureError
 from tubepose.labware.reading import read_yaml, validate
 from tubepose.transforms import FloatArray
@@ -44,12 +45,26 @@ class FolderCapture:
         unit: Unit of the cloud where the user gave one; it goes before `capture.yaml`. ``mm`` is the unit of depth
             counts without a scale too.
         depth_scale_m: Metres per count of a depth image where the user gave them; they go before all else.
+        allow_outside: Whether the files that `capture.yaml` names may lie out of the folder.
     """
 
     name: str
     path: Path
     unit: Unit | None = None
     depth_scale_m: float | None = None
+    allow_outside: bool = False
+
+    @property
+    def outside(self) -> tuple[Path, ...]:
+        """The files out of the folder that `capture.yaml` names; none where it cannot be read."""
+        if not self.allow_outside or not (self.path / CAPTURE_FILE).is_file():
+            return ()
+        try:
+            found = _described(self.path)
+        except CaptureError:
+            return ()
+        names = (name for name in (found.cloud, found.depth, found.image) if name is not None)
+        return tuple(self.path / name for name in names if leaves(name))
 
     def frames(self) -> Iterator[RgbdFrame]:
         """Yield the one frame.
@@ -58,6 +73,11 @@ class FolderCapture:
             CaptureError: A file is missing, cut, or does not fit the others.
         """
         found = _described(self.path) if (self.path / CAPTURE_FILE).is_file() else _guessed(self.path)
+        for kind, file in (("cloud", found.cloud), ("depth", found.depth), ("image", found.image)):
+            if file is not None:
+                if not self.allow_outside:
+                    require_inside(self.path, file, f"{CAPTURE_FILE}: {kind}")
+                require_regular(self.path / file, CaptureError)
         if self.unit is not None and (found.depth is None or self.unit != "m"):  # no depth count is a metre
             found = found.model_copy(update={"unit": self.unit})
         image = read_picture(self.path / found.image) if found.image is not None else None

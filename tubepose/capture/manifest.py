@@ -6,6 +6,7 @@ import hashlib
 import os
 from collections.abc import Iterable
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 from typing import Any, Literal
 
@@ -193,7 +194,13 @@ def manifest_entry_for(
 
 
 def file_sha256(path: Path) -> str:
-    """Digest of one file."""
+    """Digest of one file; taken once per process for as long as its size and time stay."""
+    found = path.stat()
+    return _read_sha256(path, found.st_ino, found.st_size, found.st_mtime_ns)
+
+
+@lru_cache(maxsize=100_000)
+def _read_sha256(path: Path, *_state: int) -> str:
     digest = hashlib.sha256()
     with path.open("rb") as stream:
         while block := stream.read(_BLOCK):
@@ -214,7 +221,9 @@ def tree_sha256(folder: Path, without: Path | None = None) -> str:
 
 
 def _listing_sha256(files: Iterable[tuple[str, str]]) -> str:
-    return hashlib.sha256("".join(f"{digest}  {path}\n" for digest, path in files).encode("utf-8")).hexdigest()
+    return hashlib.sha256(
+        "".join(f"{digest}  {path}\n" for digest, path in files).encode("utf-8", "surrogateescape")
+    ).hexdigest()
 
 
 def _measured(place: Path) -> tuple[DataFile, ...]:

@@ -91,6 +91,7 @@ class Session(BaseModel):
         printed_cap: The printed cap, or None where no trial has one.
         tubes: Every tube model that the trials name, by the name that they use.
         average: Frames of its recordings that are fused into one, as `open_captures` takes it.
+        allow_outside: Whether captures, and files that these name, may lie out of their folders.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
@@ -107,6 +108,7 @@ class Session(BaseModel):
     tubes: dict[str, TubeModel]
     trials: tuple[Trial, ...]
     average: Average = 1
+    allow_outside: bool = False
 
     def tubes_of(self, trial: Trial) -> tuple[TubeModel, ...]:
         """The kinds of tube in a trial, each once, in a fixed order."""

@@ -21,8 +21,9 @@ from tubepose.capture.frame import RgbdFrame
 from tubepose.capture.fusion import Average, AveragedCapture
 from tubepose.capture.pairing import PAIRING_TOLERANCE_NS
 from tubepose.capture.recorded import RecordedCapture
+from tubepose.capture.regular import irregular_words
 from tubepose.capture.topics import TopicChoice
-from tubepose.errors import CaptureError
+from tubepose.errors import CaptureError, readable
 
 # Truth of a simulated session: nothing that an estimator may read.
 TRUTH_FOLDER = "simulation_truth"
@@ -108,6 +109,7 @@ def open_captures(
     depth_scale_m: float | None = None,
     max_stamp_difference_ms: float | None = None,
     average: Average = 1,
+    allow_outside: bool = False,
     **topics: Unpack[TopicNames],
 ) -> list[Capture]:
     """Find the captures at a path; nothing of their content is read yet.
@@ -123,6 +125,7 @@ def open_captures(
         depth_scale_m: Metres per count of depth images, 1 for floats that are metres; it goes before what files say.
         max_stamp_difference_ms: Stamps of a picture and its cloud in a recording differ by no more; 50 by default.
         average: Frames in a row, of a static recording, that are fused into one; ``all`` of a capture.
+        allow_outside: Whether the files that a `capture.yaml` names may lie out of its folder.
         **topics: Of recordings, where several would fit; see `TopicNames`.
 
     Returns:
@@ -131,14 +134,15 @@ def open_captures(
     Raises:
         CaptureError: No such path, nothing to open there, or a unit, scale or difference that is none.
     """
+    name = None if name is None else readable(name)
     choice = TopicChoice(
         topics.get("cloud_topic"), topics.get("image_topic"), topics.get("depth_topic"), topics.get("info_topic")
     )
     given = GivenScale(_unit(unit), _scale(depth_scale_m))
-    opener = _Opener(given, choice, _difference_ns(max_stamp_difference_ms))
+    opener = _Opener(given, choice, _difference_ns(max_stamp_difference_ms), allow_outside)
     if not path.exists():
         raise CaptureError(f"{path}: no such file or folder")
-    if path.is_file() or _is_closed(path) or _is_capture(path):
+    if not path.is_dir() or _is_closed(path) or _is_capture(path):
         capture = opener.open(path, name or (path.stem if path.is_file() else path.resolve().name))
         if capture is not None:
             return _averaged([capture], average)
@@ -155,8 +159,12 @@ class _Opener:
     given: GivenScale
     topics: TopicChoice
     max_stamp_difference_ns: int
+    allow_outside: bool = False
 
     def open(self, path: Path, name: str) -> Capture | None:
+        name = readable(name)
+        if not (path.is_file() or path.is_dir()):
+            return UnreadableCapture(name, path, f"{irregular_words(path)}; expected a file or a folder")
         if _is_closed(path):
             return UnreadableCapture(name, path, "may not be read by this user; change its permissions")
         if is_recording(path):
@@ -178,7 +186,7 @@ class _Opener:
                 return BopScene(name, path, self.given)
             if is_depth_folder(path):
                 return DepthFolder(name, path, self.given)
-        return FolderCapture(name, path, self.given.unit, self.given.depth_scale_m)
+        return FolderCapture(name, path, self.given.unit, self.given.depth_scale_m, self.allow_outside)
 
 
 def _is_capture(path: Path) -> bool:
@@ -263,6 +271,8 @@ def _walk(folder: Path, inside: frozenset[Path] = frozenset()) -> Iterator[Path]
     inside |= {folder.resolve(), *folder.resolve().parents}
     for entry in sorted(folder.iterdir()):
         if entry.name.startswith(".") or entry.name == TRUTH_FOLDER:
+            continue
+        if not entry.is_dir() and not entry.is_file() and not _is_known(entry):
             continue
         if not entry.is_dir() or _is_closed(entry) or _is_capture(entry):
             yield entry

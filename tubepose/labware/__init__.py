@@ -4,6 +4,7 @@ from tubepose.labware.racks import RackModel, SlotGrid, SlotModel, SlotShape
 from tubepose.labware.reading import (
     Labware,
     catalogue,
+    labware_of,
     labware_sha256,
     load_cap,
     load_rack,
@@ -23,6 +24,7 @@ __all__ = [
     "TubeModel",
     "WallOptics",
     "catalogue",
+    "labware_of",
     "labware_sha256",
     "load_cap",
     "load_rack",

@@ -6,7 +6,7 @@ import difflib
 import hashlib
 import json
 import sys
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from functools import cache
 from importlib.resources import files
 from pathlib import Path
@@ -174,6 +174,18 @@ def read_rack_json(path: Path) -> RackModel:
         raise LabwareError(f"{path}: {side_words(rack, str(side))}")
     added = validate(SideFile, read_yaml(side, LabwareError), str(side), LabwareError)
     return validate(RackModel, complete_rack(rack, added, str(side)), f"{path} with {side.name}", LabwareError)
+
+
+def labware_of(data: Mapping[str, Any]) -> Labware:
+    """A definition from what `model_dump(mode="json")` made of it.
+
+    Raises:
+        ValueError: It is none.
+    """
+    model = _KINDS.get(str(data.get("kind")))
+    if model is None:
+        raise ValueError("no definition of labware")
+    return model.model_validate(data)
 
 
 def read_labware(path: Path) -> Labware:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -18,6 +18,8 @@ from tubepose.rack.pose import RackPose
 from tubepose.rack.settling import Registration, register_at
 from tubepose.rack.size import FaceSize
 from tubepose.transforms import HALF_TURN, QUARTER_TURN, FloatArray, transform_points
+
+_NONE: Mapping[str, tuple[str, FloatArray]] = {}
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -204,9 +206,9 @@ def example_hints(T_camera_rack: FloatArray, rack: RackModel) -> tuple[str, ...]
 class EarlierTurns:
     """Where racks stood in earlier frames in which their turn was known: by geometry, a hint, or an earlier frame."""
 
-    def __init__(self) -> None:
-        self._last: dict[str, tuple[str, FloatArray]] = {}
-        self._used: list[SlotHint] = []
+    def __init__(self, last: Mapping[str, tuple[str, FloatArray]] = _NONE, used: Iterable[SlotHint] = ()) -> None:
+        self._last = dict(last)
+        self._used = list(used)
 
     def hint(self, group: str, rack: RackModel, place: SlotHint | None, config: RackConfig) -> TurnHint:
         """The hint for the next frame: a place, until a frame's turn was known with it; then where the rack stood.

@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-import os
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, is_dataclass
 from pathlib import Path
 from typing import Any
@@ -15,106 +13,78 @@ import numpy as np
 import pandas as pd
 from pydantic import BaseModel
 
-from tubepose.errors import ConfigError
 from tubepose.report.tables import Table
+from tubepose.result_folder import make_folder, remove_files, write_aside
 
+__all__ = [
+    "csv_text",
+    "make_folder",
+    "remove_files",
+    "write_aside",
+    "write_bytes",
+    "write_csv",
+    "write_json",
+    "write_table",
+    "write_text",
+]
 
-def make_folder(path: Path) -> None:
-    """Make a folder for results before any work is done.
-
-    Raises:
-        ConfigError: It cannot be made.
-    """
-    try:
-        path.mkdir(parents=True, exist_ok=True)
-    except OSError as problem:
-        raise ConfigError(
-            f"{path}: cannot be a folder for results ({problem.strerror}); choose another place"
-        ) from None
-
-
-def remove_files(folder: Path, names: Iterable[str]) -> None:
-    """Remove results of an earlier run that this one has none of: they would lie beside results they do not belong to.
-
-    Raises:
-        ConfigError: One of them cannot be removed.
-    """
-    for name in names:
-        try:
-            (folder / name).unlink(missing_ok=True)
-        except OSError as problem:
-            raise ConfigError(
-                f"{folder / name}: of an earlier run, and cannot be removed ({problem.strerror}); choose another folder"
-            ) from None
-
-
-@contextmanager
-def write_aside(path: Path) -> Iterator[Path]:
-    """Give a path beside `path` to write to, and rename it to `path` when the block ends well.
-
-    The path aside keeps the suffix, for writers that choose their format by it. Folders are made as needed. A reader
-    never sees half a file, and an earlier one stays if the block fails.
-
-    Raises:
-        ConfigError: The place cannot be written.
-    """
-    aside = path.with_name(f".{path.stem}.part{path.suffix}")
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        yield aside
-        os.replace(aside, path)
-    except OSError as problem:
-        why = problem.strerror or str(problem)
-        raise ConfigError(
-            f"{path}: cannot be written ({why}); expected a folder to write in, choose another one"
-        ) from None
-    finally:
-        with suppress(OSError):
-            aside.unlink()
+_FORMULA = ("=", "+", "-", "@", "\t", "\r")
+"""How a cell begins that a spreadsheet would run."""
 
 
 def write_bytes(path: Path, data: bytes) -> None:
     """Write bytes, as of a picture.
 
     Raises:
-        ConfigError: The place cannot be written.
+        OutputError: The place cannot be written.
     """
     with write_aside(path) as aside:
         aside.write_bytes(data)
 
 
 def write_text(path: Path, text: str) -> None:
-    """Write text as UTF-8 with plain newlines.
+    """Write text as UTF-8 with plain newlines; what a name holds that is no UTF-8 becomes an escape.
 
     Raises:
-        ConfigError: The place cannot be written.
+        OutputError: The place cannot be written.
     """
-    write_bytes(path, text.encode("utf-8"))
+    write_bytes(path, text.encode("utf-8", "backslashreplace"))
 
 
 def write_csv(path: Path, rows: pd.DataFrame) -> None:
     """Write a table as CSV: shortest floats that read back the same, empty cells for what is missing, no index.
 
     Raises:
-        ConfigError: The place cannot be written.
+        OutputError: The place cannot be written.
         ValueError: A stamp column (``_ns``) is not of an integer type and has lost digits.
     """
     write_text(path, csv_text(rows))
 
 
 def csv_text(rows: pd.DataFrame) -> str:
-    """The text that `write_csv` writes."""
+    """The text that `write_csv` writes.
+
+    A text that a spreadsheet would run as a formula (it begins with = + - @) has an apostrophe before it.
+    """
     for name in rows.columns:
         if str(name).endswith("_ns") and len(rows) and not pd.api.types.is_integer_dtype(rows[name]):
             raise ValueError(f"column {name} has type {rows[name].dtype}; expected whole nanoseconds (Int64)")
-    return str(rows.to_csv(index=False, lineterminator="\n"))
+    shown = rows.copy(deep=False)
+    for name in shown.columns:
+        if shown[name].dtype == object or isinstance(shown[name].dtype, pd.StringDtype):
+            shown[name] = shown[name].map(_harmless)
+    return str(shown.to_csv(index=False, lineterminator="\n"))
+
+
+def _harmless(value: Any) -> Any:
+    return f"'{value}" if isinstance(value, str) and value.startswith(_FORMULA) else value
 
 
 def write_json(path: Path, data: Mapping[str, Any]) -> None:
     """Write a record as JSON, in its own order; models and NumPy values become plain ones, a NaN becomes null.
 
     Raises:
-        ConfigError: The place cannot be written.
+        OutputError: The place cannot be written.
         TypeError: A value has no place in JSON.
     """
     write_text(path, json_text(data))
@@ -153,7 +123,7 @@ def write_table(folder: Path, name: str, table: Table) -> tuple[Path, Path, Path
     """Write a table as ``name.csv`` (full precision), ``name.md`` and ``name.tex`` (rounded), and give their paths.
 
     Raises:
-        ConfigError: The place cannot be written.
+        OutputError: The place cannot be written.
     """
     csv, markdown, latex = (folder / f"{name}.{suffix}" for suffix in ("csv", "md", "tex"))
     write_csv(csv, table.values)
