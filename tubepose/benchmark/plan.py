@@ -212,7 +212,7 @@ def bench(
     with pinned_threads(1), progress("captures", len(plan.jobs)) as step:
         tables = run_jobs(
             plan.jobs, asked.methods, detector_for or bundled_detector(settings), settings, seeds=asked.seeds,
-            warm_up=True, fail_fast=asked.fail_fast, on_done=lambda done, expected: step(),
+            warm_up=True, fail_fast=asked.fail_fast, on_done=lambda _done, _expected: step(),
         )  # fmt: skip
     found = judge_run(plan, tables, asked, settings)
     if folder is not None:
