@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 from tubepose.config import PreprocessConfig, RackTopConfig
 from tubepose.labware import load_rack
 from tubepose.preprocessing import (
+    fullest_level,
     level_noise_m,
     plausible_unit_factors,
     point_spacing_m,
@@ -91,3 +92,11 @@ def test_units_under_suspicion_are_those_that_make_the_cloud_a_racks_size(scale,
 def test_a_cloud_in_metres_is_not_taken_for_millimetres():
     assert 1000.0 not in plausible_unit_factors(scenes.rack_top(RACK), RACK)
     assert 10.0 not in plausible_unit_factors(scenes.rack_top(RACK), RACK)
+
+
+def test_the_fullest_level_of_every_group_is_counted():
+    of = np.array([0, 0, 0, 0, 2, 2, 2])
+    heights = np.array([1.1, 1.9, 2.2, 5.0, 7.0, 8.6, 11.0]) * 1e-3
+    found = fullest_level(of, heights, 4, 2e-3, 0.0)
+    assert found.tolist() == [3, 0, 2, 0]
+    assert fullest_level(of[:0], heights[:0], 2, 2e-3, 0.0).tolist() == [0, 0]

@@ -55,12 +55,11 @@ def reached_over(scene: Scene, estimates: Sequence[TubeEstimate]) -> dict[str, f
         scene: The scene.
         estimates: Answers of one method.
     """
-    accepted = [e for e in estimates if e.pose.status is TubeStatus.OK and e.target.tube and e.target.slot is not None]
-    poses = [(e, e.target.tube, e.pose.T_rack_tube) for e in accepted]
     discs = [
         (e.target.slot, transform_points(T, np.array([0.0, 0.0, tube.height_m]))[:2], tube.max_radius_m)
-        for e, tube, T in poses
-        if tube is not None and T is not None
+        for e in estimates
+        if e.pose.status is TubeStatus.OK and e.target.slot is not None
+        if (tube := e.target.tube) is not None and (T := e.pose.T_rack_tube) is not None
     ]
     return {
         name: 1.0 - float(np.mean(_clear(core_m, [disc[1:] for disc in discs if disc[0] != name])))

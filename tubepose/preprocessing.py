@@ -6,6 +6,7 @@ from collections.abc import Iterator
 
 import numpy as np
 import open3d as o3d
+from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from tubepose.config import PreprocessConfig, RackTopConfig
@@ -127,3 +128,23 @@ def fit_plane(points_m: FloatArray) -> tuple[FloatArray, FloatArray]:
     centred = points_m - centroid
     normal = np.linalg.eigh(centred.T @ centred)[1][:, 0]
     return (-normal if normal @ centroid > 0 else normal), centroid
+
+
+def fullest_level(
+    of: NDArray[np.intp], heights_m: FloatArray, count: int, window_m: float, lowest_m: float
+) -> NDArray[np.intp]:
+    """How many heights of every group lie at one level, shape (count,): the most in two neighbouring bins.
+
+    Args:
+        of: Group of each height, shape (N,), below `count`.
+        heights_m: Heights, shape (N,), metres.
+        count: Number of groups.
+        window_m: Both bins together, metres.
+        lowest_m: Where the first bin begins: no height is lower.
+    """
+    if len(of) == 0:
+        return np.zeros(count, np.intp)
+    level = np.floor((heights_m - lowest_m) / (window_m / 2)).astype(np.intp)
+    width = int(level.max()) + 2
+    counts = np.bincount(of * width + level, minlength=count * width).reshape(count, width)
+    return np.asarray((counts[:, :-1] + counts[:, 1:]).max(axis=1), np.intp)

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from tubepose.config import ProfileConfig
 from tubepose.labware import RackModel, TubeModel
+from tubepose.preprocessing import fullest_level
 from tubepose.profile.identity import Names, measured_radii, name_tops, unknown_words
 from tubepose.profile.kernels import cell_values, crowded_ends, ends_on_planes, near_planes, nearest_tops
 from tubepose.profile.leftovers import NO_TOP, STRANGE_TOP, Leftover
@@ -225,12 +226,10 @@ def _share_above(measured: Measured, radius_m: FloatArray, above_m: float) -> Fl
     of, points_m = measured.label[rows], measured.points.points_m[rows]
     near = np.hypot(*(points_m[:, :2] - measured.center_m[of]).T) < MIDDLE_SHARE * radius_m[of]
     of = of[near]
-    bins = np.ceil((points_m[near, 2] - measured.level_m[of] - above_m) / (ONE_HEIGHT_M / 2)).astype(np.intp)
-    higher, width = bins > 0, max(int(bins.max(initial=0)), 1) + 2
-    inside = np.bincount(of, minlength=count)
-    counts = np.bincount(of[higher] * width + bins[higher], minlength=count * width).reshape(count, width)
-    fullest = (counts[:, :-1] + counts[:, 1:]).max(axis=1)
-    return np.asarray(fullest / np.maximum(inside, MIDDLE_POINTS))
+    up_m = points_m[near, 2] - measured.level_m[of] - above_m
+    higher = up_m > 0
+    fullest = fullest_level(of[higher], up_m[higher], count, ONE_HEIGHT_M, 0.0)
+    return np.asarray(fullest / np.maximum(np.bincount(of, minlength=count), MIDDLE_POINTS))
 
 
 def label_points(standing: Standing, center_m: FloatArray, radius_m: FloatArray) -> NDArray[np.intp]:

@@ -191,9 +191,10 @@ def refine(state: RoughFit, rack: RackModel) -> Fit:
                 state = flat
         for number, (blur_m, widths_m) in enumerate(ROUNDS_M[ROUGH_ROUNDS:], ROUGH_ROUNDS):
             _step(fine, state, top, blur_m, widths_m, tells=number == len(ROUNDS_M) - 1, bowed=bowed)
-    covariance = _covariance(state, fine, top)
+    lifted = _lifted(state, fine, top) if state.level is None else 1.0
+    covariance = _covariance(state, lifted)
     if bowed:
-        state.bow_covariance = state.bow_covariance * _lifted(state, fine, top)
+        state.bow_covariance = state.bow_covariance * lifted
     bow_std_m = np.sqrt(np.diag(state.bow_covariance))
     return Fit(rack_frame(state, rack), covariance, state.scatter_m, state.level, state.bow_m, bow_std_m)
 
@@ -203,12 +204,12 @@ def _significant(bow_m: FloatArray, covariance: FloatArray) -> bool:
     return bool(bow_m @ np.linalg.solve(covariance + LEAST_BOW_M**2 * np.eye(3), bow_m) > FLAT_CHI2)
 
 
-def _covariance(state: RoughFit, points_m: FloatArray, field: TopField) -> FloatArray:
-    """Of the pose's error, shape (6, 6): that of the last round, and what it cannot know of."""
+def _covariance(state: RoughFit, lifted: float) -> FloatArray:
+    """Of the pose's error, shape (6, 6): that of the last round, and what it cannot know of (`_lifted`, among it)."""
     inflate = INFLATE if state.level is None else INFLATE_HELD
     covariance = np.asarray(inflate @ state.covariance @ inflate + np.diag(FLOOR**2))
     if state.level is None:
-        covariance[PLANE] *= _lifted(state, points_m, field)
+        covariance[PLANE] *= lifted
         return covariance
     covariance[5, 5] += FLOOR_HELD_M**2
     # The height is that of ribs that may be seen at one end only: the level's error moves it at the centre.

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from tubepose.capture.frame import CameraIntrinsics, RgbdFrame
 from tubepose.labware import RackModel, TubeModel
+from tubepose.preprocessing import fullest_level
 from tubepose.slots.cells import core_cells, telling_cells
 from tubepose.slots.lines_of_sight import follow_sight
 from tubepose.slots.sight_kernels import AT_FACE, FILLED, KINDS, PASSED, SILENT, STANDING
@@ -140,9 +141,5 @@ def covered_cells(
         n_slots: How many slots there are.
     """
     rows = np.flatnonzero(core & np.isfinite(highest_m))
-    if len(rows) == 0:
-        return np.zeros(n_slots)
-    level = np.floor((highest_m[rows] - highest_m[rows].min()) / (LEVEL_M / 2)).astype(np.intp)
-    width = int(level.max()) + 2
-    counts = np.bincount(slot[rows] * width + level, minlength=n_slots * width).reshape(n_slots, width)
-    return np.asarray((counts[:, :-1] + counts[:, 1:]).max(axis=1), float)
+    over_m = highest_m[rows]
+    return np.asarray(fullest_level(slot[rows], over_m, n_slots, LEVEL_M, over_m.min(initial=np.inf)), float)
